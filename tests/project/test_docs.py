@@ -37,6 +37,8 @@ ELSEWHERE = {
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
     "rts cameras photos/ -o thing": "make apps",
     "rts calibrate panda.urdf --masks masks/ --joints joints.json --fov 45 -o out/camera": "make apps",
+    "rts reconstruct photos/ -o out/thing --region=-0.94,0.08,5.1,3.5": "make apps",
+    "rts reconstruct photos/ -o out/thing --masks out/thing/masks": "make apps",
 }
 """Commands that take long, or need files of their own, and who runs them."""
 

@@ -20,7 +20,10 @@ def reconstruct(
         ),
     ],
     out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("reconstruction"),
-    start: Annotated[str, typer.Option(help="ball, hull (of alpha or masks), or a file of a mesh.")] = "ball",
+    start: Annotated[
+        str | None,
+        typer.Option(help="ball, hull (of alpha or masks), points (COLMAP's), or a file.", show_default=False),
+    ] = None,
     surface: Annotated[str, typer.Option(help="mesh; isosurface: holes may open; or subdivision: smooth.")] = "mesh",
     steps: Annotated[int | None, typer.Option(help="Steps of the shape; 1300.", show_default=False)] = None,
     size: Annotated[int | None, typer.Option(help="Longer side of pictures, at most; 256.", show_default=False)] = None,
@@ -29,12 +32,18 @@ def reconstruct(
         int | None, typer.Option(help="Texels a side; 1024. 0 for vertex colours.", show_default=False)
     ] = None,
     held_out: Annotated[int, typer.Option(help="Hold out every so many views, to measure only; 0 for none.")] = 8,
-    fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit the poses of cameras, too.")] = False,
+    fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit poses and focal length, too.")] = False,
     light: Annotated[
         bool, typer.Option("--light", help="Tell light from colours, and write colours as in even light.")
     ] = False,
     background: Annotated[
         str | None, typer.Option(help="R,G,B from 0 to 1, of pictures without alpha and masks; else that of borders.")
+    ] = None,
+    masks: Annotated[
+        str, typer.Option(help="object: white where it is; ignore: black does not count; or a folder of mended ones.")
+    ] = "object",
+    region: Annotated[
+        str | None, typer.Option(help="X,Y,Z,RADIUS of a ball that the object is in; else as COLMAP's points tell.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: small pictures, few steps and faces.")] = False,
     seed: Annotated[int, typer.Option(help="Of the order of pictures.")] = 0,
@@ -44,7 +53,8 @@ def reconstruct(
 ) -> None:
     """Fit a textured mesh to photographs with cameras.
 
-    Writes mesh.obj, mesh.glb, turntable.gif, views.csv and report.html.
+    Writes mesh.obj, mesh.glb, turntable.gif, views.csv and report.html. Ends with a verdict; status 3 says that the
+    mesh does not look like the pictures.
 
     Example: rts reconstruct photos/ -o out/thing --quick && open out/thing/report.html
     """
@@ -65,7 +75,9 @@ def reconstruct(
             held_out=held_out,
             fit_cameras=fit_cameras,
             light=light,
-            background=None if background is None else _colour(background),
+            background=None if background is None else _numbers("--background", background, "three", "1,1,1"),
+            masks=masks,
+            region=None if region is None else _numbers("--region", region, "four", "0,0,0,1"),
             quick=quick,
             seed=seed,
             resume=resume,
@@ -78,9 +90,12 @@ def reconstruct(
     if first():
         names = ", ".join(file.name for file in found.files)
         _say(f"{found!r}: {names} in {out}")
+        _say(str(found.verdict))
     if watch is not None:
         _say(f"{watch.url} shows the result until “close” is pressed there, or Ctrl-C here")
         watch.wait()
+    if found.verdict.blob:
+        raise typer.Exit(3)
 
 
 def cameras(
@@ -114,8 +129,8 @@ def _viewer(port: int) -> Any:
     return watch
 
 
-def _colour(text: str) -> list[float]:
+def _numbers(option: str, text: str, count: str, example: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise rts.InputError(f"--background is {text!r:.60}; expected three numbers, such as 1,1,1") from None
+        raise rts.InputError(f"{option} is {text!r:.60}; expected {count} numbers, such as {example}") from None

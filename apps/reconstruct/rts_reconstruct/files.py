@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from rts_reconstruct.light import decoded
 from rts_reconstruct.measures import Measured
 from rts_reconstruct.model import Model
 from rts_reconstruct.pictures import Pictures
+from rts_reconstruct.texturing import seen_texels
 
 FRAMES, FPS, TURNTABLE = 36, 12, 256
 TEXTURE_FILES = ("mesh.mtl", "texture.png")
@@ -94,9 +96,11 @@ def write_light(path: Path, model: Model) -> list[Path]:
 
 def write_cameras(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
     """Write fitted cameras, in the data set's world, as a model of COLMAP: `cameras/cameras.txt` and others."""
-    moved = []
+    moved, scale = [], np.ones((4, 4))
+    scale[0, 0] = scale[1, 1] = np.exp(model.focal[0])
     for number, view, pose in zip(pictures.numbers, pictures.given, model.poses, strict=True):
         camera = view.camera.within(pictures.world.motion(np.asarray(rts.rigid(pose.astype(np.float64)))))
+        camera = camera.replace(projection=camera.projection * scale, aspect=None)
         name = view.name or f"{number}.png"
         moved.append(rts.View(camera, lambda: np.zeros(0), view.size, name=name, path=view.path, lens=view.lens))
     rts.save_views(folder / "cameras", moved)
@@ -125,14 +129,20 @@ def _obj(vertices: np.ndarray, model: Model, colors: np.ndarray | None) -> str:
 
 
 def write_turntable(path: Path, model: Model, pictures: Pictures) -> None:
-    """Write an animation of the model, which turns about the axis that is up in most pictures, on white."""
+    """Write an animation of the model on white.
+
+    It turns about the axis that is up in most pictures, and starts where the first camera is.
+    """
     ups = np.array([np.linalg.inv(np.asarray(v.camera.view))[:3, 1] for v in pictures.views])
     up = ups.mean(axis=0)
     up = up / length if (length := np.linalg.norm(up)) > 0.2 else np.array([0.0, 1.0, 0.0])
-    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    across /= np.linalg.norm(across)
     low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    across = np.linalg.inv(np.asarray(pictures.views[0].camera.view))[:3, 3] - middle
+    across -= (across @ up) * up
+    if np.linalg.norm(across) < 0.1 * radius:  # It looks from above.
+        across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
     frames = []
     for angle in 2 * np.pi * np.arange(FRAMES) / FRAMES:
         way = np.cos(angle) * across + np.sin(angle) * np.cross(up, across) + 0.4 * up
@@ -152,6 +162,21 @@ def write_table(path: Path, rows: Sequence[Measured]) -> None:
             iou = "" if row.iou is None else f"{row.iou:.4f}"
             shares = f"{row.psnr:.2f}", f"{row.ssim:.4f}", iou
             writer.writerow([row.number, row.name, int(row.held_out), *shares, row.camera])
+
+
+def forget_unfinished(folder: Path) -> None:
+    """Remove folders of files that a run which was killed had not finished."""
+    for beside in folder.glob(".new-*"):
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def write_unseen(path: Path, model: Model, known: np.ndarray) -> list[Path]:
+    """Write a picture of the texture's size, white where no picture sees the surface; `known` (V,) tells the others."""
+    assert model.atlas is not None
+    picture = seen_texels(model, known, len(model.atlas.texture))
+    hidden = (picture[..., 3] > 0.5) & (picture[..., 0] < 0.5)
+    Image.fromarray(_bytes(hidden.astype(np.float32))).save(path)
+    return [path]
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

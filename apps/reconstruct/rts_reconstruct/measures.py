@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-import torch
 
 import rts
+from rts_reconstruct.masks import where
 from rts_reconstruct.model import Model, moved_camera
-from rts_reconstruct.pictures import Pictures, on, where
+from rts_reconstruct.pictures import Pictures, on
 
 SIGMA, RADIUS = 1.5, 5
 """Width and reach of SSIM's window, pixels: 11 × 11, as its authors have it."""
@@ -43,7 +43,7 @@ class Measured(NamedTuple):
 def shown(model: Model, pictures: Pictures, place: int) -> np.ndarray:
     """A render (H, W, 4) of a model as a view has it; `place` counts the views to fit, then those held out."""
     view = (pictures.views + pictures.held_out)[place]
-    moved = moved_camera({"poses": torch.tensor(model.poses)}, view.camera, place)
+    moved = moved_camera(model.cameras, view.camera, place)
     camera = moved.map(lambda matrix: np.asarray(matrix))
     background = None if pictures.outlined else pictures.background
     return np.clip(np.asarray(rts.render(model.part, camera, view.size, supersample=2, background=background)), 0, 1)
@@ -51,25 +51,27 @@ def shown(model: Model, pictures: Pictures, place: int) -> np.ndarray:
 
 def measured(model: Model, pictures: Pictures) -> list[Measured]:
     """Measures of all views, on the pictures' background; pixels that masks leave out do not count in the PSNR."""
-    rows = []
-    for place, view in enumerate(pictures.views + pictures.held_out):
-        render = shown(model, pictures, place)
-        image = view.image
-        pair = [
-            on(image, pictures.background),
-            on(render if pictures.outlined else render[..., :3], pictures.background),
-        ]
-        weights = np.ones(view.size) if view.mask is None else view.mask
-        error = float((weights[..., None] * (pair[0] - pair[1]) ** 2).sum() / (3 * max(weights.sum(), 1)))
-        iou = None
-        if pictures.outlined:
-            a, b = (weights > 0.5) & (image[..., 3] > 0.5), (weights > 0.5) & (render[..., 3] > 0.5)
-            iou = float((a & b).sum() / max((a | b).sum(), 1))
-        psnr = -10 * float(np.log10(max(error, SMALL)))
-        held_out = place >= len(pictures.views)
-        camera = "fitted" if model.poses[place].any() else "given"
-        rows.append(Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou, camera))
-    return rows
+    return [measured_view(model, pictures, place) for place in range(len(pictures.numbers))]
+
+
+def measured_view(model: Model, pictures: Pictures, place: int) -> Measured:
+    """Measures of one view; `place` counts the views to fit, then those held out."""
+    view = (pictures.views + pictures.held_out)[place]
+    render, image = shown(model, pictures, place), view.image
+    pair = [
+        on(image, pictures.background),
+        on(render if pictures.outlined else render[..., :3], pictures.background),
+    ]
+    weights = np.ones(view.size) if view.mask is None else view.mask
+    error = float((weights[..., None] * (pair[0] - pair[1]) ** 2).sum() / (3 * max(weights.sum(), 1)))
+    iou = None
+    if pictures.outlined:
+        a, b = (weights > 0.5) & (image[..., 3] > 0.5), (weights > 0.5) & (render[..., 3] > 0.5)
+        iou = float((a & b).sum() / max((a | b).sum(), 1))
+    psnr = -10 * float(np.log10(max(error, SMALL)))
+    held_out = place >= len(pictures.views)
+    camera = "fitted" if model.poses[place].any() else "given"
+    return Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou, camera)
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:

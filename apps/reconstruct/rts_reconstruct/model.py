@@ -1,10 +1,11 @@
-"""The model that is fitted: a mesh, its colours or its texture, and the poses of cameras."""
+"""The model that is fitted: a mesh, its colours or its texture, and cameras."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
 import rts
@@ -34,7 +35,8 @@ class Model(NamedTuple):
     """A mesh (V, 3), (T, 3) with colours (V, 3) or an atlas; poses (B, 6) of the world before each camera.
 
     Vertices are in the world of `Pictures`, colours sRGB-encoded, poses in the order of `Pictures.numbers`. `light`
-    (9, 3) is that of `light.irradiance`; None where colours have it in them.
+    (9, 3) is that of `light.irradiance`; None where colours have it in them. `focal` (1,) is the logarithm of a factor
+    on the focal lengths of all cameras.
     """
 
     vertices: np.ndarray
@@ -43,6 +45,12 @@ class Model(NamedTuple):
     poses: np.ndarray
     atlas: Atlas | None = None
     light: np.ndarray | None = None
+    focal: np.ndarray = np.zeros(1, np.float32)
+
+    @property
+    def cameras(self) -> dict[str, Any]:
+        """The parameters of `moved_camera`."""
+        return {"poses": torch.tensor(self.poses), "focal": torch.tensor(self.focal)}
 
     @property
     def part(self) -> rts.Part:
@@ -88,5 +96,13 @@ def surface_of(model: Model) -> Any:
 
 
 def moved_camera(p: Any, camera: rts.Camera, view: Any) -> rts.Camera:
-    """The camera of a view, with the world before it moved by the view's pose."""
-    return camera.within(rts.rigid(p["poses"][view]))
+    """The camera of a view, with the world before it moved by the view's pose, and its focal length as it is fitted.
+
+    Args:
+        p: "poses" (B, 6), and "focal" (1,), the logarithm of a factor.
+        camera: the camera as it was given.
+        view: the view's number.
+    """
+    moved = camera.within(rts.rigid(p["poses"][view]))
+    grown = torch.diag(torch.tensor([1.0, 1.0, 0.0, 0.0])) * (torch.exp(p["focal"]) - 1)
+    return moved.replace(projection=torch.as_tensor(moved.projection, dtype=grown.dtype) * (1 + grown), aspect=None)

@@ -14,6 +14,7 @@ from PIL import Image
 from rts_reconstruct.measures import Measured, mean_of, shown
 from rts_reconstruct.model import Model
 from rts_reconstruct.pictures import Pictures, on
+from rts_reconstruct.verdict import Verdict
 
 MOST = 8
 """The most views that are shown."""
@@ -29,7 +30,13 @@ th { border-bottom: 1px solid #999 } .held { background: #eef4ff } .pair { displ
 
 
 def write_report(
-    path: Path, model: Model, pictures: Pictures, rows: Sequence[Measured], losses: Sequence[list[float]], told: str
+    path: Path,
+    model: Model,
+    pictures: Pictures,
+    rows: Sequence[Measured],
+    losses: Sequence[list[float]],
+    told: str,
+    verdict: Verdict,
 ) -> None:
     """Write the report.
 
@@ -40,6 +47,7 @@ def write_report(
         rows: measures, of views to fit and then of those held out.
         losses: those of the steps of each stage.
         told: a line on the whole.
+        verdict: the verdict on it.
     """
     first = len(pictures.views) if pictures.held_out else 0
     last = len(rows)
@@ -51,6 +59,7 @@ def write_report(
 <html lang="en"><head><meta charset="utf-8"><title>Reconstruction</title><style>{STYLE}</style></head><body>
 <h1>Reconstruction</h1>
 <p>{html.escape(told)}</p>
+{_verdict(verdict)}
 <figure><img alt="The mesh, turning" src="{_data((path.parent / "turntable.gif").read_bytes(), "gif")}"></figure>
 <h2>{title}</h2>
 <p>Left the picture, in the middle the render, on the right their difference (grey where they are the same).</p>
@@ -63,6 +72,12 @@ def write_report(
 """,
         encoding="utf-8",
     )
+
+
+def _verdict(verdict: Verdict) -> str:
+    head = "Not a reconstruction" if verdict.blob else "Findings" if verdict.findings else "No fault was found"
+    findings = "".join(f"<li>{html.escape(finding)}</li>" for finding in verdict.findings)
+    return f"<h2>{head}</h2><p>{html.escape(verdict.figures)}</p><ul>{findings}</ul>"
 
 
 def _pair(model: Model, pictures: Pictures, row: Measured, place: int) -> str:

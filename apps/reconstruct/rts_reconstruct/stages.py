@@ -22,6 +22,10 @@ ROUNDS = 5
 """Rounds of remeshing."""
 
 
+FOCAL = 0.1
+"""The learning rate of focal lengths, as a share of that of poses: a step changes all pictures."""
+
+
 class Stage(NamedTuple):
     """Steps with one set of rates, on a mesh of about so many faces.
 
@@ -87,7 +91,8 @@ def fitted(
     start = dict(shape.start)
     rates = {"shape": stage.shape * shape.rate, "colors": stage.colors}
     if settings.cameras:
-        start["poses"], rates["poses"] = torch.tensor(model.poses), stage.poses
+        start |= model.cameras
+        rates |= {"poses": stage.poses, "focal": FOCAL * stage.poses}
     residuals = rts.ViewResiduals(
         shape.part,
         pictures.views,
@@ -106,8 +111,9 @@ def fitted(
         callback=lambda step, p, loss: report(step, loss, lambda: shape.mesh(p)),
         progress=settings.progress,
     )
-    poses = fit.parameters["poses"].numpy() if settings.cameras else model.poses
-    found = Model(*shape.mesh(fit.parameters), poses)
+    found = model._replace(**dict(zip(("vertices", "faces", "colors"), shape.mesh(fit.parameters), strict=True)))
+    if settings.cameras:
+        found = found._replace(**{name: fit.parameters[name].numpy() for name in model.cameras})
     return tessellated(found) if settings.surface == "subdivision" else found, fit.history
 
 

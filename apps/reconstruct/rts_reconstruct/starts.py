@@ -13,6 +13,7 @@ import trimesh
 
 import rts
 from rts_reconstruct.pictures import Pictures
+from rts_reconstruct.points import visible
 
 RADIUS = 0.57
 """The ball's radius, as a share of that of a ball that all cameras see."""
@@ -22,18 +23,23 @@ CLOSED = 5
 """The width of a window, in points of the lattice; gaps of a hull that it does not fit into are filled."""
 
 
-def start(kind: str | Path, pictures: Pictures) -> trimesh.Trimesh:
+def start(kind: str | Path | None, pictures: Pictures) -> trimesh.Trimesh:
     """A mesh to start from, in the world of the pictures.
 
     Args:
-        kind: "ball", "hull", or the path of a mesh in the world of the data set.
+        kind: "ball", "hull", "points", or the path of a mesh in the world of the data set; None for "points" where
+            these tell a solid, else "ball".
         pictures: the pictures.
 
     Raises:
         InputError: a hull of pictures that do not tell the object, or whose masks have nothing in common; a file that
             cannot be read; or a mesh that no view sees.
     """
-    if str(kind) == "ball":
+    if kind is None:
+        kind = "ball" if pictures.solid is None else "points"
+    if str(kind) == "points":
+        mesh = _of_points(pictures)
+    elif str(kind) == "ball":
         mesh = trimesh.creation.icosphere(4, radius=RADIUS)
     elif str(kind) == "hull":
         mesh = _hull(pictures)
@@ -41,6 +47,15 @@ def start(kind: str | Path, pictures: Pictures) -> trimesh.Trimesh:
         mesh = _of_file(kind, pictures)
     _check_seen(mesh.vertices, pictures.views)
     return mesh
+
+
+def _of_points(pictures: Pictures) -> trimesh.Trimesh:
+    if pictures.solid is None:
+        raise rts.InputError(
+            "start is 'points', and there are no points of COLMAP, or too few; expected a folder with sparse/0 (rts "
+            "cameras makes one), and the extra photos, that is pycolmap"
+        )
+    return pictures.solid
 
 
 def _of_file(path: str | Path, pictures: Pictures) -> trimesh.Trimesh:
@@ -98,6 +113,8 @@ def least_alpha(pictures: Pictures, count: int) -> np.ndarray:
     least, seen = np.ones(len(points)), np.zeros(len(points), int)
     for view in pictures.views:
         alpha = view.image[..., 3]
+        if view.mask is not None:
+            alpha = np.where(view.mask < 0.5, 1, alpha)  # Pixels that do not count exclude nothing.
         x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
         inside = visible(view, points)
         found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
@@ -105,14 +122,6 @@ def least_alpha(pictures: Pictures, count: int) -> np.ndarray:
         seen += inside
     least[seen < 2] = 0  # Space that nobody looks into is no object.
     return least.reshape((count,) * 3)
-
-
-def visible(view: rts.View, points: np.ndarray) -> np.ndarray:
-    """True for points (N, 3) that lie before the camera, within its picture."""
-    pixels = np.asarray(view.camera.project(points, view.size))[..., :2]
-    height, width = view.size
-    before = np.asarray(view.camera.depth(points)) > 0
-    return before & ((pixels >= 0) & (pixels <= (width, height))).all(axis=-1)
 
 
 def _check_seen(vertices: np.ndarray, views: Sequence[rts.View]) -> None:

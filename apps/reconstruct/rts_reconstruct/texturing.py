@@ -35,8 +35,8 @@ def _baked(model: Model, size: int) -> Model:
     atlas.generate(pack_options=_options(size))
     rows, faces, uv = atlas[0]
     faces, uv = faces.astype(np.int32), uv.astype(np.float32)
-    picture = _flat(uv, faces, model.colors[rows], size)
-    texture = _spread(picture[..., :3], picture[..., 3] < 0.5)
+    picture = flat(uv, faces, model.colors[rows], size)
+    texture = spread(picture[..., :3], picture[..., 3] < 0.5)
     corners = model.faces[np.arange(len(faces))]  # Faces keep their order; their corners have rows of the map.
     assert np.array_equal(rows[faces], corners), "the atlas has another order of faces"
     return model._replace(atlas=Atlas(uv, faces, texture.astype(np.float32)))
@@ -50,23 +50,33 @@ def in_even_light(model: Model) -> Model:
     if atlas is not None:
         rows = np.zeros(len(atlas.uv), int)
         rows[atlas.faces.reshape(-1)] = model.faces.reshape(-1)
-        picture = _flat(atlas.uv, atlas.faces, normals[rows].astype(np.float32), len(atlas.texture))
-        ways = _spread(picture[..., :3], picture[..., 3] < 0.5).reshape(-1, 3)
+        picture = flat(atlas.uv, atlas.faces, normals[rows].astype(np.float32), len(atlas.texture))
+        ways = spread(picture[..., :3], picture[..., 3] < 0.5).reshape(-1, 3)
         ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
         texture = light.even(atlas.texture.reshape(-1, 3), ways, known)
         atlas = atlas._replace(texture=texture.reshape(atlas.texture.shape))
     return model._replace(colors=colors, atlas=atlas, light=known.astype(np.float32))
 
 
-def _flat(uv: np.ndarray, faces: np.ndarray, colors: np.ndarray, size: int) -> np.ndarray:
-    """The picture (R, R, 4) of an atlas, which is a flat mesh, with colours (U, 3)."""
+def flat(uv: np.ndarray, faces: np.ndarray, colors: np.ndarray, size: int, outputs: Any = None) -> Any:
+    """The picture (R, R, 4) of an atlas, which is a flat mesh, with colours (U, 3); or `outputs` as of `rts.render`."""
     flat = np.concatenate([uv, np.zeros_like(uv[:, :1])], axis=1)
     part = rts.Part(rts.Mesh(faces), {"vertices": flat, "colors": colors}, "unlit")
     camera = rts.Camera.orthographic((0.5, 0.5, 1), (0.5, 0.5, 0), height=1.0, aspect=1.0, far=2.0)
-    return np.asarray(rts.render(part, camera, (size, size), splatter="none"))
+    options = {} if outputs is None else {"outputs": outputs}
+    return rts.render(part, camera, (size, size), splatter="none", **options)
 
 
-def _spread(texture: np.ndarray, bare: np.ndarray) -> np.ndarray:
+def seen_texels(model: Model, known: np.ndarray, size: int) -> np.ndarray:
+    """A picture (R, R, 4) of the model's atlas, whose colours are 1 where a vertex of `known` (V,) is near, else 0."""
+    assert model.atlas is not None
+    rows = np.zeros(len(model.atlas.uv), int)
+    rows[model.atlas.faces.reshape(-1)] = model.faces.reshape(-1)
+    colors = np.repeat(known[rows, None], 3, axis=1).astype(np.float32)
+    return flat(model.atlas.uv, model.atlas.faces, colors, size)
+
+
+def spread(texture: np.ndarray, bare: np.ndarray) -> np.ndarray:
     """The texture with colours of the nearest others at bare texels, so that averages at seams are of such colours."""
     nearest: Any = scipy.ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True)
     return texture[tuple(nearest)]
@@ -79,21 +89,28 @@ def _options(size: int) -> Any:
 
 
 def fitted(
-    model: Model, pictures: Pictures, steps: int, settings: Settings, checkpoint: Path | None, report: Any
+    model: Model,
+    known: np.ndarray,
+    pictures: Pictures,
+    steps: int,
+    settings: Settings,
+    checkpoint: Path | None,
+    report: Any,
 ) -> tuple[Model, list[float]]:
     """The model with its texture fitted to the pictures, and the losses of the steps; see `stages.fitted`.
 
     A step moves each texel by the weighted mean of differences at the pixels that show it, as in SIRT (Gilbert 1972,
     *Iterative Methods for the Three-dimensional Reconstruction of an Object from Projections*). Adam would move texels
     that pictures hardly show as far as all others, and fill the texture with specks. Texels that no picture shows stay
-    as they are.
+    as they are: `known` (V,) tells the vertices that one shows. Averages over a footprint would move them, too.
     """
     assert model.atlas is not None
     atlas: Atlas = model.atlas
     surface = surface_of(model)
-    poses = {"poses": torch.tensor(model.poses)}
-    bare = _flat(atlas.uv, atlas.faces, np.ones((len(atlas.uv), 3), np.float32), len(atlas.texture))[..., 3] < 0.5
-    scale = torch.tensor(np.where(bare[..., None], 0, _scales(model, pictures)))  # Between charts nothing is fitted.
+    known_cameras = model.cameras
+    shown = seen_texels(model, known, len(atlas.texture))
+    bare = shown[..., 3] < 0.5  # Between charts nothing is fitted.
+    scale = torch.tensor(np.where(shown[..., :1] < 0.5, 0, _scales(model, pictures)))
     start = torch.tensor(atlas.texture)
     batch = min(settings.batch, len(pictures.views))
 
@@ -105,7 +122,7 @@ def fitted(
         pictures.views,
         batch=batch,
         seed=settings.seed,
-        cameras=(lambda p, camera, view: moved_camera(poses, camera, view)) if settings.cameras else None,
+        cameras=(lambda p, camera, view: moved_camera(known_cameras, camera, view)) if settings.cameras else None,
         background=None if pictures.outlined else pictures.background,
     )
 
@@ -125,7 +142,7 @@ def fitted(
         callback=lambda step, p, loss: report(step, loss, lambda: (model.vertices, model.faces, colors_of(p))),
         progress=settings.progress,
     )
-    texture = _spread(np.clip(texture_of(fit.parameters).numpy(), 0, 1), bare)
+    texture = spread(np.clip(texture_of(fit.parameters).numpy(), 0, 1), bare)
     atlas = atlas._replace(texture=texture)
     return model._replace(atlas=atlas, colors=atlas.colors(model.faces, len(model.vertices))), fit.history
 
@@ -136,11 +153,11 @@ def _scales(model: Model, pictures: Pictures) -> np.ndarray:
     Gradient descent by changes is then descent by texels, where each has one over its weight as its rate.
     """
     assert model.atlas is not None
-    surface, poses = surface_of(model), {"poses": torch.tensor(model.poses)}
+    surface, cameras = surface_of(model), model.cameras
     texture = torch.tensor(model.atlas.texture, requires_grad=True)
     for number, view in enumerate(pictures.views):
         part = textured(surface, model.vertices, model.atlas.uv, texture)
-        image = rts.render(part, moved_camera(poses, view.camera, number), view.size)
+        image = rts.render(part, moved_camera(cameras, view.camera, number), view.size)
         image[..., : view.image.shape[2]].mean().backward()  # Linear in the texture: the gradient is the weight.
     assert texture.grad is not None
     weights = texture.grad[..., :1].numpy() / len(pictures.views)

@@ -54,7 +54,7 @@ class Watching:
 
 @pytest.fixture
 def no_pause(monkeypatch):
-    monkeypatch.setattr("rts_reconstruct.reconstruction.PAUSE_S", 0.0)
+    monkeypatch.setattr("rts_reconstruct.run.PAUSE_S", 0.0)
 
 
 @pytest.mark.thorough

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from rts_reconstruct import files, measures, pictures, stages, starts, texturing, world
+from rts_reconstruct import files, masks, measures, pictures, stages, starts, texturing, world
 from rts_reconstruct.model import Model
 from rts_reconstruct.saved import Saved
 from seen_ellipsoid import CENTER, DISTANCE, RADII, SIZE, cameras, ellipsoid, images, on_white, views
@@ -112,7 +112,7 @@ def test_pixels_that_a_lens_leaves_no_picture_are_no_object_mask(tmp_path, maske
             frame["mask_path"] = f"mask_{i}.png"
     (tmp_path / "transforms.json").write_text(json.dumps(tree))
     loaded = rts.load_views(tmp_path, linear=False)
-    assert (loaded[0].mask < 0.5).mean() > 2 * pictures.OUTSIDE
+    assert (loaded[0].mask < 0.5).mean() > 2 * masks.OUTSIDE
     found = pictures.read(tmp_path, SIZE, 0)
     assert found.outlined == masked
     corner, middle = found.views[0].mask[0, 0], found.views[0].mask[SIZE // 2, SIZE // 2]

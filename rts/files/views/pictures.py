@@ -100,7 +100,7 @@ def with_mask(pose: Pose, mask: Path | None, reduced: int = 1) -> Pose:
     if size != pose.size and not all(abs(a - reduced * b) < reduced for a, b in zip(size, pose.size, strict=True)):
         raise InputError(
             f"the mask {mask} has {size[1]} × {size[0]} pixels, and {pose.path} {pose.size[1]} × {pose.size[0]}; "
-            "expected masks of the size of the pictures"
+            "expected masks of the size of the pictures" + (": this one is turned" if size == pose.size[::-1] else "")
         )
     return pose._replace(mask=mask, mask_size=size)
 

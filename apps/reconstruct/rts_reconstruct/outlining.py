@@ -1,0 +1,119 @@
+"""Outlines of pictures that come without: those of a solid, written as masks to be looked at and mended."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import scipy.ndimage
+import trimesh
+from PIL import Image
+
+import rts
+from rts_reconstruct.solid import CELL
+from rts_reconstruct.world import World
+
+BLACK, GREY, WHITE = 0, 128, 255
+"""Background, pixels that do not count, and the object, in masks that are written and read again."""
+LARGEST = 1024
+"""Longer sides of pictures in which masks are drawn, at most."""
+
+
+def cut_out(view: rts.View, solid: trimesh.Trimesh, world: World) -> rts.View:
+    """A view of a data set with alpha where it sees a solid of another world.
+
+    Pixels nearer to the outline than a cell of the solid's lattice do not count.
+    """
+
+    @functools.cache
+    def both() -> tuple[np.ndarray, np.ndarray]:
+        return _silhouette(solid, world.camera(view.camera), view.size)
+
+    def image() -> np.ndarray:
+        alpha = both()[0][..., None]
+        return np.concatenate([view.image[..., :3] * alpha, alpha], axis=2)
+
+    def mask() -> np.ndarray:
+        return both()[1] if view.mask is None else both()[1] * view.mask
+
+    return rts.View(
+        view.camera, functools.cache(image), view.size, name=view.name, mask=functools.cache(mask), path=view.path
+    )
+
+
+def _silhouette(solid: trimesh.Trimesh, camera: rts.Camera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha (H, W) of a solid, and 1 at pixels farther from its outline than a cell at its middle, else 0."""
+    theta = {
+        "vertices": np.asarray(solid.vertices, np.float32),
+        "colors": np.ones((len(solid.vertices), 3), np.float32),
+    }
+    part = rts.Part(rts.Mesh(np.asarray(solid.faces, np.int32)), theta, "unlit")
+    alpha = np.asarray(rts.render(part, camera, size, splatter="none"))[..., 3]
+    shown = alpha > 0.5
+    if shown.all() or not shown.any():
+        return alpha, np.ones(size, np.float32)
+    depth = max(float(np.asarray(camera.depth(np.zeros((1, 3))))[0]), CELL)
+    band = max(1.0, CELL * camera.projection[1, 1] * size[0] / (2 * depth))
+    inside, outside = (np.asarray(scipy.ndimage.distance_transform_edt(kind)) for kind in (shown, ~shown))
+    away = np.where(shown, inside, outside)
+    return alpha, (away > band).astype(np.float32)
+
+
+def write_masks(folder: Path, views: Sequence[rts.View], solid: trimesh.Trimesh, world: World) -> None:
+    """Write NAME.png for each view of a data set: white for the object, black behind it, grey where it is not known."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, view in enumerate(views):
+        height, width = view.size
+        shrink = max(1.0, max(view.size) / LARGEST)
+        size = (max(1, round(height / shrink)), max(1, round(width / shrink)))
+        alpha, counts = _silhouette(solid, world.camera(view.camera), size)
+        levels = np.where(counts < 0.5, GREY, np.where(alpha > 0.5, WHITE, BLACK)).astype(np.uint8)
+        Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST).save(folder / _file(view, number))
+
+
+def mended(views: Sequence[rts.View], folder: Path) -> list[rts.View]:
+    """Views of a data set with alpha by masks as `write_masks` writes them.
+
+    Raises:
+        InputError: masks are missing, of another size, or cannot be read.
+    """
+    names = [_file(view, number) for number, view in enumerate(views)]
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        named = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
+        raise rts.InputError(f"{folder} lacks {len(missing)} of {len(views)} masks: {named}")
+    return [_masked(view, folder / name) for view, name in zip(views, names, strict=True)]
+
+
+def _masked(view: rts.View, file: Path) -> rts.View:
+    def levels() -> np.ndarray:
+        with Image.open(file) as picture:
+            return np.asarray(picture.convert("L"))
+
+    try:
+        with Image.open(file) as picture:
+            width, height = picture.size
+    except OSError as error:
+        raise rts.InputError(f"the mask {file} cannot be read as a picture ({error})") from None
+    if (height, width) != view.size:
+        raise rts.InputError(
+            f"the mask {file} has {width} × {height} pixels, and its picture {view.size[1]} × {view.size[0]}; expected "
+            "masks of the size of the pictures" + (": this one is turned" if (width, height) == view.size else "")
+        )
+
+    def image() -> np.ndarray:
+        alpha = (levels() > GREY)[..., None].astype(np.float32)
+        return np.concatenate([view.image[..., :3] * alpha, alpha], axis=2)
+
+    def mask() -> np.ndarray:
+        level = levels()
+        counts = ((level < GREY / 2) | (level > (GREY + WHITE) / 2)).astype(np.float32)
+        return counts if view.mask is None else counts * view.mask
+
+    return rts.View(view.camera, image, view.size, name=view.name, mask=mask, path=view.path, lens=view.lens)
+
+
+def _file(view: rts.View, number: int) -> str:
+    return f"{Path(view.name).name or number}.png"

@@ -1,0 +1,227 @@
+"""Pictures that come without masks, or with wrong ones: points, solids, outlines, verdicts."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from rts_reconstruct import contradictions, detail, files, outlining, pictures, points, posing, sight, solid, texturing
+from rts_reconstruct.measures import measured
+from rts_reconstruct.model import Model, moved_camera
+from rts_reconstruct.points import Points
+from rts_reconstruct.stages import Settings
+from rts_reconstruct.verdict import verdict
+from rts_reconstruct.world import World
+from seen_ellipsoid import CENTER, RADII, SIZE, cameras, ellipsoid, images, on_white, views
+
+import rts
+
+
+def sphere(count=3000, radius=0.5, distance=3.0):
+    """Points of a sphere about the origin, each seen by six cameras if its front faces them."""
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    places = distance * np.concatenate([np.eye(3), -np.eye(3)])
+    pairs = [(i, eye) for i, way in enumerate(ways) for eye in places if (eye - radius * way) @ way > 0.3]
+    return Points(radius * ways, np.array([i for i, _ in pairs]), np.array([eye for _, eye in pairs]))
+
+
+def truth():
+    """The ellipsoid as a model, in the world of pictures about CENTER whose unit is 1."""
+    ball = trimesh.creation.icosphere(3)
+    colors = np.stack(
+        [0.5 + 0.5 * ball.vertices[:, 0], np.full(len(ball.vertices), 0.3), 0.5 - 0.5 * ball.vertices[:, 0]]
+    )
+    poses = np.zeros((len(images()), 6), np.float32)
+    return Model(np.float32(RADII * ball.vertices), np.int32(ball.faces), colors.T.astype(np.float32), poses)
+
+
+def about(found, model):
+    """A model about CENTER, in the world of pictures."""
+    return model._replace(vertices=found.world.inside(CENTER + model.vertices).astype(np.float32))
+
+
+# ----------------------------------------------------------------------------------------------------------- points
+
+
+def test_the_region_is_about_the_densest_points_that_most_cameras_look_at():
+    rng = np.random.default_rng(1)
+    near, far = 0.3 * sphere().positions / 0.5, rng.uniform(-8, 8, size=(400, 3))
+    found = points.region(Points(CENTER + np.concatenate([near, far]), np.zeros(1, int), np.zeros((1, 3))), views())
+    np.testing.assert_allclose(found.center, CENTER, atol=0.05)
+    assert 0.3 < found.unit < 0.4
+    few = Points(CENTER + near[:50], np.zeros(1, int), np.zeros((1, 3)))
+    assert points.region(few, views()) is None
+
+
+def test_distances_of_points_are_in_percent_of_the_diagonal():
+    ball = trimesh.creation.icosphere(5, radius=0.5)
+    away = points.distances(sphere(radius=0.6), World(np.zeros(3), 1.0), ball.vertices, np.int32(ball.faces))
+    np.testing.assert_allclose(away, 100 * 0.1 / np.sqrt(3), rtol=0.02)
+
+
+def test_cameras_on_one_side_span_the_angle_between_them():
+    pair = [
+        rts.View(rts.Camera.look_at(eye, (0, 0, 0)), np.zeros((2, 2, 3), np.float32)) for eye in ((0, 0, 3), (3, 0, 0))
+    ]
+    assert points.span(pair, np.zeros(3)) == pytest.approx(90)
+
+
+@pytest.mark.thorough
+def test_what_lies_behind_points_is_a_solid():
+    found = solid.solid_of(sphere())
+    away = np.linalg.norm(found.vertices, axis=1) - 0.5
+    assert found.is_watertight and np.abs(away).mean() < 0.5 * solid.CELL
+    assert solid.solid_of(Points(np.full((1, 3), 5.0), np.zeros(1, int), np.full((1, 3), 9.0))) is None
+
+
+# -------------------------------------------------------------------------------------------------- outlines, masks
+
+
+def test_pixels_near_the_outline_of_a_solid_do_not_count():
+    world, ball = World(CENTER, 1.0), trimesh.creation.icosphere(3, radius=0.6)
+    view = outlining.cut_out(rts.View(cameras()[0], on_white(images()[0])), ball, world)
+    alpha, counts = view.image[..., 3], view.mask
+    assert alpha[SIZE // 2, SIZE // 2] == 1 and counts[SIZE // 2, SIZE // 2] == 1
+    assert (alpha[0] == 0).all() and (counts[0] == 1).all()
+    edges = np.abs(np.diff(alpha, axis=1)) > 0.5
+    assert edges.any() and (counts[:, 1:][edges] == 0).all()
+
+
+def test_masks_that_were_written_are_read_again_as_they_are_mended(tmp_path):
+    world, ball = World(CENTER, 1.0), trimesh.creation.icosphere(3, radius=0.6)
+    plain = views(on_white)
+    outlining.write_masks(tmp_path, plain, ball, world)
+    levels = np.array(Image.open(tmp_path / "0.png.png"))
+    assert set(np.unique(levels)) == {outlining.BLACK, outlining.GREY, outlining.WHITE}
+    levels[:4] = outlining.WHITE
+    Image.fromarray(levels).save(tmp_path / "0.png.png")
+    found = pictures.read(plain, SIZE, 0, masks=tmp_path)
+    assert found.outlined and (found.views[0].image[:4, :, 3] == 1).all()
+    np.testing.assert_array_equal(
+        found.views[1].mask == 0, np.array(Image.open(tmp_path / "1.png.png")) == outlining.GREY
+    )
+    (tmp_path / "2.png.png").unlink()
+    with pytest.raises(rts.InputError, match=r"lacks 1 of 8 masks: 2.png.png"):
+        pictures.read(plain, SIZE, 0, masks=tmp_path)
+
+
+def masked(inverted):
+    """Views with masks, of which some are inverted."""
+    return [
+        rts.View(
+            v.camera, on_white(v.image), name=v.name, mask=1 - v.image[..., 3] if i in inverted else v.image[..., 3]
+        )
+        for i, v in enumerate(views())
+    ]
+
+
+def test_inverted_masks_are_refused_with_a_name_and_the_polarity():
+    with pytest.raises(rts.InputError, match=r"white along the border and black within: 0.png.*expected white where"):
+        pictures.read(masked(range(8)), SIZE, 0)
+
+
+def test_a_mask_that_contradicts_the_others_is_named():
+    assert contradictions.contradictions(pictures.read(masked(()), SIZE, 0)) == []
+    (line,) = contradictions.contradictions(pictures.read(masked([5]), SIZE, 0))
+    assert "masks contradict each other:" in line  # Of so few views none is outvoted.
+    more = []
+    for i, camera in enumerate(cameras(20)):
+        alpha = np.asarray(rts.render(ellipsoid(), camera, (SIZE, SIZE)))[..., 3]
+        image = np.full((SIZE, SIZE, 3), 0.5, np.float32)
+        more.append(rts.View(camera, image, name=f"{i}.png", mask=1 - alpha if i == 5 else alpha))
+    (line,) = contradictions.contradictions(pictures.read(more, SIZE, 0))
+    assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1
+
+
+def test_masks_of_colmap_only_say_which_pixels_count():
+    found = pictures.read(masked(()), SIZE, 0, np.ones(3), masks="ignore")
+    assert not found.outlined
+    np.testing.assert_allclose(found.views[0].mask, images()[0][..., 3], atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ verdict, texture
+
+
+def test_a_verdict_tells_a_blob_from_what_looks_like_the_pictures():
+    found = pictures.read(views(), SIZE, 0)
+    settings = Settings(4, 0, False, "mesh", False)
+    fine, small = about(found, truth()), about(found, truth()._replace(vertices=0.4 * truth().vertices))
+    rows = measured(fine, found)
+    told = verdict(fine, found, rows, [[1.0] * 20 + [0.1] * 20], 0.0, settings)
+    assert not told.blob and told.findings == () and "no fault was found" in str(told)
+    blob = verdict(small, found, measured(small, found), [[1.0] * 40], 0.0, settings)
+    assert blob.blob and "not a reconstruction" in str(blob) and "contradict" in str(blob)
+
+
+def test_a_focal_length_is_a_factor_on_the_camera():
+    camera = rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, aspect=1.0)
+    moved = moved_camera(truth()._replace(focal=np.float32([np.log(1.1)])).cameras, camera, 0)
+    point = np.array([[0.3, -0.2, 0.5]], np.float32)
+    before, after = (np.asarray(c.project(point, (100, 100)))[0, :2] - 50 for c in (camera, moved.map(np.asarray)))
+    np.testing.assert_allclose(after, 1.1 * before, rtol=1e-5)
+
+
+def test_cameras_that_are_anchored_see_the_same_and_are_where_they_were():
+    found = pictures.read(views(), SIZE, 0)
+    model = about(found, truth())
+    motion = np.float32([0.1, -0.2, 0.15, 0.05, 0.1, -0.1])
+    away = model._replace(poses=np.repeat(motion[None], len(model.poses), axis=0))
+    back = posing.anchored(away, found)
+    np.testing.assert_allclose(back.poses, 0, atol=1e-5)
+    for view in found.views[:3]:
+        seen = [
+            np.asarray(moved_camera(m.cameras, view.camera, 0).map(np.asarray).project(m.vertices, view.size))[:, :2]
+            for m in (away, back)
+        ]
+        np.testing.assert_allclose(seen[0], seen[1], atol=1e-3)
+
+
+def test_colours_that_no_view_sees_come_from_beside():
+    mesh = trimesh.creation.icosphere(2)
+    colors = np.where(mesh.vertices[:, :1] > 0, [[1.0, 0, 0]], [[0, 0, 1.0]]).astype(np.float32)
+    model = Model(np.float32(mesh.vertices), np.int32(mesh.faces), colors, np.zeros((1, 6), np.float32))
+    known = np.abs(mesh.vertices[:, 0]) > 0.5
+    found = sight.filled(model, known).colors
+    np.testing.assert_array_equal(found[known], colors[known])
+    assert (found[~known] >= -1e-5).all() and (found[~known] <= 1 + 1e-5).all()
+    middle = np.abs(mesh.vertices[:, 0]) < 1e-6
+    np.testing.assert_allclose(found[middle][:, [0, 2]].mean(axis=0), 0.5, atol=0.05)
+    assert sight.unseen_share(model, known) == pytest.approx(0.5, abs=0.2)
+
+
+@pytest.mark.thorough
+def test_detail_of_the_pictures_as_they_are_is_added_to_the_texture():
+    fine = 256
+    stripes = np.float32([0.5, 0.5, 0.5]) * (1 + np.sign(np.sin(60 * np.linspace(0, 1, 256)))[None, :, None])
+    ball = trimesh.creation.icosphere(4)
+    way = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    uv = np.float32(np.stack([0.5 + 0.5 * way[:, 0], 0.5 + 0.5 * way[:, 1]], axis=1))
+    theta = {
+        "vertices": np.float32(CENTER + RADII * ball.vertices),
+        "uv": uv,
+        "texture": np.repeat(stripes, 256, axis=0),
+    }
+    part = rts.Part(rts.Mesh(ball.faces), theta, "unlit")
+    whole = [rts.View(c, np.asarray(rts.render(part, c, (fine, fine), supersample=2)).clip(0, 1)) for c in cameras()]
+    found = pictures.read(whole, fine // 8, 0)
+    grey = np.full((len(ball.vertices), 3), 0.5, np.float32)
+    poses = np.zeros((len(whole), 6), np.float32)
+    model = Model(np.float32(found.world.inside(theta["vertices"])), np.int32(ball.faces), grey, poses)
+    plain = texturing.baked(model, 256)
+    sharp = detail.detailed(plain, found)
+    assert len(sharp.atlas.texture) >= 256
+    errors = []
+    for each in (plain, sharp):
+        seen = np.asarray(rts.render(each.part, found.world.camera(whole[0].camera), (fine, fine)))
+        inside = (seen[..., 3] == 1) & (whole[0].image[..., 3] == 1)
+        errors.append(np.square(seen - whole[0].image)[inside][:, :3].mean())
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_what_a_run_that_was_killed_had_not_finished_is_removed(tmp_path):
+    (tmp_path / ".new-abc").mkdir()
+    (tmp_path / ".new-abc/mesh.obj").write_text("")
+    (tmp_path / "mesh.obj").write_text("")
+    files.forget_unfinished(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["mesh.obj"]
