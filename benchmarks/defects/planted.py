@@ -125,8 +125,8 @@ LOOPS = [
     Defect(
         "the farther of two surfaces ends at a break",
         "rts/outlines/spans_loops.py",
-        "        return 0 if za < zb else 1\n",
-        "        return 1 if za < zb else 0\n",
+        "(0 if z < deep else 1)\n",
+        "(1 if z < deep else 0)\n",
         "edges edges_bodies",
     ),
     Defect(
@@ -195,8 +195,8 @@ LOOPS = [
     Defect(
         "outlines that turn have no corners",
         "rts/outlines/segments_loops.py",
-        "corner[s, i] += alone * (sharp[i] - corner[s, i]) if alone > 0 else 0.0",
-        "corner[s, i] += 0.0",
+        "x, y = x + alone * (sharp[0] - x), y + alone * (sharp[1] - y)",
+        "x, y = x + 0.0, y + 0.0",
         "edges edges_bodies",
     ),
     Defect(
@@ -209,8 +209,8 @@ LOOPS = [
     Defect(
         "flux along y has the sign of that along x",
         "rts/splatting/edges/weights_loops.py",
-        "flux[0, m, 1] -= rate * first * dx",
-        "flux[0, m, 1] += rate * first * dx",
+        "flux[s, k, 0, m, 1] -= rate * first * dx",
+        "flux[s, k, 0, m, 1] += rate * first * dx",
         "edges edges_bodies edges_soups",
     ),
     Defect(
@@ -223,15 +223,15 @@ LOOPS = [
     Defect(
         "gradients of opacity forget the light that passes",
         "rts/splatting/edges/stacks_loops.py",
-        "g_rgba[n, count - 1] -= through[k] * behind[k, c] * g[y, x, c]",
-        "g_rgba[n, count - 1] -= behind[k, c] * g[y, x, c]",
+        "g_rgba[n, count - 1] -= through[k] * hidden",
+        "g_rgba[n, count - 1] -= hidden",
         "edges_operations",
     ),
     Defect(
         "composites behind a layer are those behind the next",
         "rts/splatting/edges/stacks_loops.py",
-        "behind[k, c] = rgba[n, c] + (1 - rgba[n, alpha]) * behind[k + 1, c]",
-        "behind[k, c] = (1 - rgba[n, alpha]) * behind[k + 1, c]",
+        "back = rgba[n, c] + (1 - rgba[n, alpha]) * back",
+        "back = (1 - rgba[n, alpha]) * back",
         "edges_operations edges_glass",
     ),
     Defect(

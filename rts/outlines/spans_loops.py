@@ -202,12 +202,24 @@ def spans_of(
                     continue
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
                 least, most = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
-                for g in range(table[n, low], table[n, high]):
-                    start, end = least - 0.5 - gap[g, 1 - axis], most - 0.5 - gap[g, 1 - axis]
-                    if min(end, 1.0) - max(start, 0.0) > TINY:
-                        names[count, 0], names[count, 1] = g, t
-                        _fill(spans, count, start, end, line, corners, gap[g, 1 - axis] + 0.5)
-                        count += 1
+                on_line = table[n, low], table[n, high], 1 - axis
+                count = _add(t, on_line, least, most, gap, line, corners, names, spans, count)
+
+
+@compiled
+def _add(t, on_line, least, most, gap, line, corners, names, spans, count):
+    """Add the spans of a triangle on gaps of a line, where it is seen from `least` to `most`; returns `count`.
+
+    `on_line` are the first gap, the one after the last, and the column of `gap` that tells where they begin.
+    """
+    first, last, column = on_line
+    for g in range(first, last):
+        start, end = least - 0.5 - gap[g, column], most - 0.5 - gap[g, column]
+        if min(end, 1.0) - max(start, 0.0) > TINY:
+            names[count, 0], names[count, 1] = g, t
+            _fill(spans, count, start, end, line, corners, gap[g, column] + 0.5)
+            count += 1
+    return count
 
 
 @compiled

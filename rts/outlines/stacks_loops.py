@@ -334,6 +334,66 @@ def _next_knot(knots, k, known):
     return found
 
 
+@compiled
+def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides):
+    """Find the changes of the stack along a gap, and fill them in if asked to; returns their number.
+
+    `numbers` are those of spans, of knots, of runs that are in the stack at first, of the first change, and `fill`.
+    """
+    n, known, count, base, fill = numbers
+    found, place, most = 0, 0.0, sides.shape[2]
+    for k in range(known):
+        for _ in range(count * count):  # Runs that pass through one another before the next knot.
+            there, m = _next_meeting(stack, count, own, place, knots[k])
+            if m < 0:
+                break
+            place = max(place, there)
+            if _seen(stack, m, most, of):
+                if fill:
+                    enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
+                    e = base + found
+                    _record(e, 2, m, -1, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                found += 1
+            stack[m], stack[m + 1] = stack[m + 1], stack[m]
+        place = knots[k]
+        if k + 1 == known or place >= 1 or (k > 0 and place <= knots[k - 1]):
+            continue
+        m = _next_ending(stack, count, own, of, place)
+        while m < count:
+            other = _partner(stack[m], n, own, of, place, HIGH, AFTER)
+            partner = _index(stack, count, other) if other >= 0 else -1
+            m, partner = (partner, m) if 0 <= partner < m else (m, partner)
+            if _seen(stack, m, most, of):
+                if fill:
+                    enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
+                    e = base + found
+                    _record(e, 0, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                found += 1
+            for x in (partner, m):
+                if x >= 0:
+                    _remove(stack, count, x)
+                    count -= 1
+            m = _next_ending(stack, count, own, of, place)
+        farther, i = _next_knot(knots, k, known), _next_starting(0, n, own, of, place)
+        while i < n:
+            low, partner = own[i, LOW], -1
+            m = _insert(stack, count, i, own, low, min(farther, own[i, HIGH]))
+            of[i, INSIDE], count = 1, count + 1
+            other = _partner(i, n, own, of, low, LOW, BEFORE)
+            if other >= 0 and of[other, LIVE] == 1 and of[other, INSIDE] == 0:
+                partner = _insert(stack, count, other, own, low, min(farther, own[other, HIGH]))
+                of[other, INSIDE], count = 1, count + 1
+                m, partner = (m, partner) if partner > m else (partner, m + 1)
+            if _seen(stack, m, most, of):
+                if fill:
+                    enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
+                    e = base + found
+                    _record(e, 1, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                found += 1
+            i = _next_starting(i + 1, n, own, of, place)
+    return found
+
+
 @loop
 def changes(
     first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
@@ -370,7 +430,7 @@ def changes(
         longest, most_changes = max(longest, begins[g + 1] - begins[g]), max(most_changes, counts[g])
     own, of = np.empty((longest, 8)), np.empty((longest, 7), np.int64)
     stack, knots = np.empty(longest + 1, np.int64), np.empty(2 * longest + 1)
-    enders, most = np.empty((most_changes, 2), np.int64), sides.shape[2]
+    enders = np.empty((most_changes, 2), np.int64)
     for g in range(first, last):
         n, base = begins[g + 1] - begins[g], at[g]
         for i in range(n):
@@ -380,60 +440,13 @@ def changes(
             own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
             of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
             of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE] = -1, -1, 0, 0
-        known, count, found, place = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0, 0, 0.0
+        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0
         for i in range(n):
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))
                 of[i, INSIDE], count = 1, count + 1
-        for k in range(known):
-            for _ in range(count * count):  # Runs that pass through one another before the next knot.
-                there, m = _next_meeting(stack, count, own, place, knots[k])
-                if m < 0:
-                    break
-                place = max(place, there)
-                if _seen(stack, m, most, of):
-                    if fill:
-                        enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
-                        e = base + found
-                        _record(e, 2, m, -1, place, stack, count, own, of, whole, place_of, samples, places, sides)
-                    found += 1
-                stack[m], stack[m + 1] = stack[m + 1], stack[m]
-            place = knots[k]
-            if k + 1 == known or place >= 1 or (k > 0 and place <= knots[k - 1]):
-                continue
-            m = _next_ending(stack, count, own, of, place)
-            while m < count:
-                other = _partner(stack[m], n, own, of, place, HIGH, AFTER)
-                partner = _index(stack, count, other) if other >= 0 else -1
-                m, partner = (partner, m) if 0 <= partner < m else (m, partner)
-                if _seen(stack, m, most, of):
-                    if fill:
-                        enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
-                        e = base + found
-                        _record(e, 0, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
-                    found += 1
-                for x in (partner, m):
-                    if x >= 0:
-                        _remove(stack, count, x)
-                        count -= 1
-                m = _next_ending(stack, count, own, of, place)
-            farther, i = _next_knot(knots, k, known), _next_starting(0, n, own, of, place)
-            while i < n:
-                low, partner = own[i, LOW], -1
-                m = _insert(stack, count, i, own, low, min(farther, own[i, HIGH]))
-                of[i, INSIDE], count = 1, count + 1
-                other = _partner(i, n, own, of, low, LOW, BEFORE)
-                if other >= 0 and of[other, LIVE] == 1 and of[other, INSIDE] == 0:
-                    partner = _insert(stack, count, other, own, low, min(farther, own[other, HIGH]))
-                    of[other, INSIDE], count = 1, count + 1
-                    m, partner = (m, partner) if partner > m else (partner, m + 1)
-                if _seen(stack, m, most, of):
-                    if fill:
-                        enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
-                        e = base + found
-                        _record(e, 1, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
-                    found += 1
-                i = _next_starting(i + 1, n, own, of, place)
+        numbers = n, known, count, base, fill
+        found = _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides)
         if not fill:
             counts[g] = found
             continue

@@ -69,22 +69,19 @@ def cells(first, last, positions, rgba, row, joined, out):
     """Fill lines `first` to `last` of `out` (H, W, 2 C): composites, and what moves along their slopes."""
     (most, _, width), count = row.shape, rgba.shape[1]
     through, behind = np.empty(most), np.empty((most, count))
-    for y in range(first, last):
-        for x in range(width):
-            out[y, x] = 0.0
-            layers = _weigh(rgba, row, y, x, through)
-            _stack(rgba, row, y, x, layers, behind)
-            for k in range(layers):
-                n = row[k, y, x]
-                left, right = _beside(row, joined, k, y, x, 0)
-                up, down = _beside(row, joined, k, y, x, 1)
-                across, along = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
-                for c in range(count):
-                    out[y, x, c] += through[k] * rgba[n, c]
-                    out[y, x, count + c] -= (
-                        _change(rgba, behind, k, through[k], left, right, c) * across
-                        + _change(rgba, behind, k, through[k], up, down, c) * along
-                    )
+    for i in range(first * width, last * width):
+        y, x = i // width, i % width
+        layers, out[y, x] = _weigh(rgba, row, y, x, through), 0.0
+        _stack(rgba, row, y, x, layers, behind)
+        for k in range(layers):
+            n = row[k, y, x]
+            left, right = _beside(row, joined, k, y, x, 0)
+            up, down = _beside(row, joined, k, y, x, 1)
+            across, along = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
+            for c in range(count):
+                aside = _change(rgba, behind, k, through[k], left, right, c) * across
+                out[y, x, c] += through[k] * rgba[n, c]
+                out[y, x, count + c] -= aside + _change(rgba, behind, k, through[k], up, down, c) * along
 
 
 @loop
@@ -92,26 +89,21 @@ def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (H, W, 2 C) with the derivative of `cells` along tangents; empty ones are zeros."""
     (most, _, width), count = row.shape, rgba.shape[1]
     through, behind = np.empty(most), np.empty((most, count))
-    colored, moved = len(t_rgba) > 0, len(t_positions) > 0
-    for y in range(first, last):
-        for x in range(width):
-            out[y, x] = 0.0
-            layers = _weigh(rgba, row, y, x, through)
-            _stack(rgba, row, y, x, layers, behind)
-            for k in range(layers):
-                n = row[k, y, x]
-                if colored:
-                    for c in range(count):
-                        out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, count - 1] * behind[k, c])
-                if not moved:
-                    continue
-                left, right = _beside(row, joined, k, y, x, 0)
-                up, down = _beside(row, joined, k, y, x, 1)
-                for c in range(count):
-                    out[y, x, count + c] -= (
-                        _change(rgba, behind, k, through[k], left, right, c) * t_positions[n, 0]
-                        + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
-                    )
+    for i in range(first * width, last * width):
+        y, x = i // width, i % width
+        layers, out[y, x] = _weigh(rgba, row, y, x, through), 0.0
+        _stack(rgba, row, y, x, layers, behind)
+        for k in range(layers if len(t_rgba) else 0):
+            n = row[k, y, x]
+            for c in range(count):
+                out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, count - 1] * behind[k, c])
+        for k in range(layers if len(t_positions) else 0):
+            n = row[k, y, x]
+            left, right = _beside(row, joined, k, y, x, 0)
+            up, down = _beside(row, joined, k, y, x, 1)
+            for c in range(count):
+                aside = _change(rgba, behind, k, through[k], left, right, c) * t_positions[n, 0]
+                out[y, x, count + c] -= aside + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
 
 
 @loop
@@ -119,26 +111,22 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `cells`; empty ones are not wanted."""
     (most, height, width), count = row.shape, rgba.shape[1]
     through, behind = np.empty(most), np.empty((most, count))
-    colored, moved = len(g_rgba) > 0, len(g_positions) > 0
-    for y in range(height):
-        for x in range(width):
-            layers = _weigh(rgba, row, y, x, through)
-            _stack(rgba, row, y, x, layers, behind)
-            for k in range(layers):
-                n = row[k, y, x]
-                if colored:
-                    hidden = 0.0
-                    for c in range(count):
-                        g_rgba[n, c] += through[k] * g[y, x, c]
-                        hidden += behind[k, c] * g[y, x, c]
-                    g_rgba[n, count - 1] -= through[k] * hidden
-                if not moved:
-                    continue
-                left, right = _beside(row, joined, k, y, x, 0)
-                up, down = _beside(row, joined, k, y, x, 1)
-                across, along = 0.0, 0.0
-                for c in range(count):
-                    across += _change(rgba, behind, k, through[k], left, right, c) * g[y, x, count + c]
-                    along += _change(rgba, behind, k, through[k], up, down, c) * g[y, x, count + c]
-                g_positions[n, 0] -= across
-                g_positions[n, 1] -= along
+    for i in range(height * width):
+        y, x = i // width, i % width
+        layers = _weigh(rgba, row, y, x, through)
+        _stack(rgba, row, y, x, layers, behind)
+        for k in range(layers if len(g_rgba) else 0):
+            n, hidden = row[k, y, x], 0.0
+            for c in range(count):
+                g_rgba[n, c] += through[k] * g[y, x, c]
+                hidden += behind[k, c] * g[y, x, c]
+            g_rgba[n, count - 1] -= through[k] * hidden
+        for k in range(layers if len(g_positions) else 0):
+            n, across, along = row[k, y, x], 0.0, 0.0
+            left, right = _beside(row, joined, k, y, x, 0)
+            up, down = _beside(row, joined, k, y, x, 1)
+            for c in range(count):
+                across += _change(rgba, behind, k, through[k], left, right, c) * g[y, x, count + c]
+                along += _change(rgba, behind, k, through[k], up, down, c) * g[y, x, count + c]
+            g_positions[n, 0] -= across
+            g_positions[n, 1] -= along

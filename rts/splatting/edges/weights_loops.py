@@ -79,6 +79,23 @@ def _add_flux(flux, s, k, pull, i, lone, t, first, second, dx, dy):
         flux[s, k, 1, m, 1] -= rate * second * dx
 
 
+@compiled
+def _add_piece(flux, area, s, pull, i, lone, piece, share_of, first, second):
+    """Add a straight piece of a segment to the flux in its four cells, and to areas (4,) on the right of the way.
+
+    `piece` are its place t as of `_add_flux`, x and y of its middle, and its way; `share_of` its shares on the right
+    and below. `first` and `second` are weights of both jumps.
+    """
+    t, px, py, dx, dy = piece
+    for k in range(4):
+        east, south = k == 1 or k == 2, k >= 2
+        height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
+        area[k] -= height * dx
+        of_cell = (share_of[0] if east else 1 - share_of[0]) * (share_of[1] if south else 1 - share_of[1])
+        if of_cell > 0 and (first != 0 or second != 0):
+            _add_flux(flux, s, k, pull, i, lone, t, of_cell * first, of_cell * second, dx, dy)
+
+
 @loop
 def weigh_segments(
     first, last, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, path, share, cell_side,
@@ -152,16 +169,9 @@ def weigh_segments(
                 px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
                 u = t * turn if i == 0 else (1 - t) * turn + t
                 counts = not lone or abs(px - path[s, 0, 0]) + abs(py - path[s, 0, 1]) <= 0.5
-                right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
-                below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
-                for k in range(4):
-                    east, south = k == 1 or k == 2, k >= 2
-                    height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
-                    area[k] -= height * dx
-                    of_cell = (right if east else 1 - right) * (below if south else 1 - below) * counts
-                    if of_cell > 0:
-                        of_jumps = of_cell * (1 - u) * sign0, of_cell * u * sign1
-                        _add_flux(flux, s, k, pull, i, lone, t, *of_jumps, dx, dy)
+                share_of = min(max((px - 0.5) / border + 0.5, 0.0), 1.0), min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+                piece = t, px, py, dx, dy
+                _add_piece(flux, area, s, pull, i, lone, piece, share_of, counts * (1 - u) * sign0, counts * u * sign1)
         for k in range(4):
             # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
             after, until = side0 >= k, side1 >= k
