@@ -59,9 +59,8 @@ def main() -> None:
             rows[0].append(view.image[..., :3])
             rows[1].append(rts.render(mesh, view.camera, view.size, background=(1.0, 1.0, 1.0))[..., :3])
         height, width = min(x.shape[:2] for row in rows for x in row)
-        picture = np.concatenate(
-            [np.concatenate([x[9 : height - 9, 9 : width - 9] for x in row], axis=1) for row in rows]
-        )
+        inside = slice(9, height - 9), slice(9, width - 9)  # Undistorted pictures have a black rim.
+        picture = np.concatenate([np.concatenate([x[inside] for x in row], axis=1) for row in rows])
         rts.save_image(IMAGES / "photographs.png", picture[::2, ::2])
 
 
