@@ -28,7 +28,7 @@ FINE = 35.0
 TRIED = 3
 """The most views whose cameras are tried."""
 FRONT, AROUND = 100.0, 150.0
-"""Angles between cameras, degrees: at less they see a front, and at less than the second one side."""
+"""The largest angle between two cameras, degrees: at less they see a front; at more than the second, all around."""
 UNSEEN = 0.2
 """The share of the surface that may go unseen."""
 
@@ -75,7 +75,8 @@ def verdict(
     if pictures.points is not None and pictures.region is not None:
         away = points.distances(pictures.points, pictures.region, pictures.world.outside(model.vertices), model.faces)
     figures = f"PSNR {psnr:.1f} dB"
-    figures += "" if overlap is None else f", overlap of outlines {overlap:.3f}"
+    if overlap is not None and not pictures.by_points:  # Masks of the points' own solid overlap in any case.
+        figures += f", overlap of outlines {overlap:.3f}"
     if away is not None:
         figures += f", points off by {away[0]:.2f} % of the diagonal, 90th percentile {away[1]:.2f} %"
     figures += f", {100 * unseen:.0f} % of the surface unseen"
@@ -98,10 +99,9 @@ def verdict(
             f"the cameras are within {angle:.0f}° and do not surround a thing: this is a front, and what is behind it "
             "is made up; take pictures from all around"
         )
-    elif angle < AROUND:
-        findings.append(f"the cameras are within {angle:.0f}°, on one side: the other side is made up")
     elif unseen > UNSEEN:
-        findings.append("much of the surface is in no picture: take more from where it is seen")
+        where = "" if angle >= AROUND else f", and cameras are within {angle:.0f}° of one another"
+        findings.append(f"much of the surface is in no picture{where}: what faces away from them is made up")
     return Verdict(blob, figures, tuple(findings))
 
 
