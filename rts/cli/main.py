@@ -243,13 +243,12 @@ def render(
     start = time.perf_counter()
     lines: list[str] = []
     parts = next(filter(None, frames))
-    scene = lit(parts)
     if output.suffix.lower() in ANIMATIONS:
         empty = over_background(np.zeros((*shape, 4), np.float32), color)
         images = (rts.render(lit(f), seen, shape, **options, background=color) if f else empty for f in frames)
         rts.save_animation(output, images, FPS)
     else:
-        found = rts.render(scene, seen, shape, **options, background=color, outputs=names)
+        found = rts.render(lit(parts), seen, shape, **options, background=color, outputs=names)
         lines = write_outputs(output, {name: engine_object.to_numpy(x) for name, x in found.items()}, exposure)
     seconds = time.perf_counter() - start
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
@@ -258,7 +257,7 @@ def render(
     for line in lines if names != ("color",) else ():
         _say(escape(f"  {line}"))
     if profile:
-        typer.echo(rts.profile(scene, seen, shape, **options))
+        typer.echo(rts.profile(lit(parts), seen, shape, **options))
 
 
 @app.command(

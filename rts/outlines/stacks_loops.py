@@ -221,9 +221,13 @@ def _index(stack, count, i):
 
 
 @compiled
-def _record(e, kind, at, partner, place, stack, count, own, of, whole, place_of, samples, places, sides):
-    """Fill in a change of the stack, but for the samples of what ends there; see `changes`."""
-    most, entries = sides.shape[2], samples.shape[1] - 2
+def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, whole, place_of, samples, places, sides):
+    """Fill in change f of the stack along a gap, but for the samples of what ends there; see `changes`.
+
+    `enders[f]` are filled with the runs that change, the second one −1 for none.
+    """
+    e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == 2 else partner
+    enders[f, 0], enders[f, 1] = stack[at], stack[second] if second >= 0 else -1
     whole[e, 1], place_of[e] = kind, place
     samples[e], sides[e] = -1, -1
     places[e] = place
@@ -350,9 +354,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             place = max(place, there)
             if _seen(stack, m, most, of):
                 if fill:
-                    enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
-                    e = base + found
-                    _record(e, 2, m, -1, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    change = base, found, 2, m, -1, place
+                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             stack[m], stack[m + 1] = stack[m + 1], stack[m]
         place = knots[k]
@@ -365,9 +368,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             m, partner = (partner, m) if 0 <= partner < m else (m, partner)
             if _seen(stack, m, most, of):
                 if fill:
-                    enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
-                    e = base + found
-                    _record(e, 0, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    change = base, found, 0, m, partner, place
+                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             for x in (partner, m):
                 if x >= 0:
@@ -386,9 +388,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                 m, partner = (m, partner) if partner > m else (partner, m + 1)
             if _seen(stack, m, most, of):
                 if fill:
-                    enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
-                    e = base + found
-                    _record(e, 1, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    change = base, found, 1, m, partner, place
+                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             i = _next_starting(i + 1, n, own, of, place)
     return found

@@ -16,19 +16,15 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.plugin_base import promised
 from rts.scene.row_cameras import RowCameras
-from rts.shading.visibility import mean_visibility
-from rts.shadows import seen_from
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
-from rts.testing.compatibility import SIZE
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, differentiating, names, split
+from rts.testing.shadow_claims import claim_shadows_dim
 
 ROWS = 64
 STEP = 1e-6
 TOLERANCE = 1e-5
-LAMPS = {"color": "direction", "intensity": "position"}
-"""The brightness of lights in θ["light"], and their place."""
 
 
 class ShaderConformance(Conformance):
@@ -201,41 +197,13 @@ class ShaderConformance(Conformance):
 
     def test_shadows_dim_what_lights_add(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """θ["light"]["shadow"] multiplies what each light adds by the visibility of samples, and so its derivative."""
-        light = theta.get("light")
-        counts = _lamps(light) if isinstance(light, Mapping) else {}
-        if not counts:
-            pytest.skip("theta['light'] has no 'direction' or 'position' of a light")
-        ball, total = scenes.ball(), sum(counts.values())
-        first, second = (seen_from(ball, camera, SIZE, layers=1) for camera in (scenes.CAMERA, scenes.PARALLEL))
-        shadows: list[Any] = [(first, [first, second], None)[i % 3] for i in range(total)]
-        brightness = {name: np.broadcast_to(light.get(name, 1.0), (counts[name], 3)) for name in counts}
 
-        def shaded(at: Any, engine: Engine | None, lit: np.ndarray, shadow: list) -> Any:
-            """The colours at positions, of lights as bright as `lit` (total, 1) says."""
-            share = zip(LAMPS, np.split(lit, [counts.get("color", 0)]), strict=True)
-            inputs = {**theta, "light": {**light, **{n: s * brightness[n] for n, s in share if n in counts}}}
-            inputs["light"]["shadow"] = shadow
-            inputs = {"theta": map_leaves(derivatives.single, inputs), "gbuffer": {**gbuffer, "position": at}}
-            return _call(shader, inputs, engine)
+        def shaded(inputs: dict, at: Any, engine: Engine | None) -> Any:
+            """The colours at positions, for entries of θ."""
+            singles = {"theta": map_leaves(derivatives.single, inputs), "gbuffer": {**gbuffer, "position": at}}
+            return _call(shader, singles, engine)
 
-        def expected(at: Any, engine: Engine | None) -> Any:
-            colors = dark = shaded(at, engine, np.zeros((total, 1)), [None] * total)
-            for shadow, one in zip(shadows, np.eye(total)[:, :, None], strict=True):
-                colors = colors + mean_visibility(shadow, at) * (shaded(at, engine, one, [None] * total) - dark)
-            return colors
-
-        def found(at: Any, engine: Engine | None) -> Any:
-            return shaded(at, engine, np.ones((total, 1)), shadows)
-
-        at, weights = gbuffer["position"], np.random.default_rng(0).standard_normal((ROWS, 1))
-        claim_close(found(at, None), expected(at, None), TOLERANCE, "the colour in shadows")
-        engine = derivatives.installed()[0]  # All agree on visibility.
-        slopes = [
-            derivatives.derivatives(engine, lambda x, f=f: f(x[0], engine), [at], [at], weights).gradient[0]
-            for f in (found, expected)
-        ]
-        scale = max(1.0, float(np.abs(slopes[1]).max()))
-        claim_close(slopes[0], slopes[1], TOLERANCE * scale, f"in {engine.name}, the gradient of the colour in shadows")
+        claim_shadows_dim(shaded, theta, gbuffer["position"])
 
     # ------------------------------------------------------------------------------------------- errors
 
@@ -282,12 +250,6 @@ def awkward(gbuffer: dict) -> dict:
         if name not in ("position", "normal", "uv"):
             value[35:40] = 0
     return gbuffer
-
-
-def _lamps(light: Mapping[str, Any]) -> dict[str, int]:
-    """The number of lights, by the name of their brightness."""
-    places = {name: np.reshape(light[place], (-1, 3)) for name, place in LAMPS.items() if place in light}
-    return {name: len(place) for name, place in places.items()}
 
 
 def _instance(shader: Any) -> Shader:

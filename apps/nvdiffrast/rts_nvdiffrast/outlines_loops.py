@@ -18,31 +18,6 @@ JOINED, BEYOND = -np.inf, np.inf
 """In place of the depth at a walk's end: the sheet joins both centres, or goes on behind the next one."""
 
 
-@loop
-def neighbours(tri, order):
-    """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 for none, or several.
-
-    `order` (3 T,) sorts edges, numbered 3 · triangle + corner opposite, by their two vertices.
-    """
-    found = np.full((len(tri), 3), -1, np.int32)
-    first = 0
-    while first < len(order):
-        ends, last = _ends(tri, order[first]), first + 1
-        while last < len(order) and _ends(tri, order[last]) == ends:
-            last += 1
-        if last - first == 2:
-            one, other = order[first], order[first + 1]
-            found[one // 3, one % 3], found[other // 3, other % 3] = other // 3, one // 3
-        first = last
-    return found
-
-
-@compiled
-def _ends(tri, edge):
-    a, b = tri[edge // 3, (edge + 1) % 3], tri[edge // 3, (edge + 2) % 3]
-    return min(a, b), max(a, b)
-
-
 @compiled
 def _crossing(corners, i, j, place, axis):
     """Where the edge between two corners crosses a way along an axis, at a `place` across it.
@@ -50,24 +25,23 @@ def _crossing(corners, i, j, place, axis):
     Returns:
         The place along the way, and z/w; NaN where the edge does not cross the way, or behind the eye.
     """
-    p, q, across = corners[i], corners[j], 1 - axis
-    a, b = p[across] - place * p[3], q[across] - place * q[3]
-    if (a > 0) == (b > 0):
-        return np.nan, np.nan
+    a = corners[i, 1 - axis] - place * corners[i, 3]
+    b = corners[j, 1 - axis] - place * corners[j, 3]
     s = a / (a - b)
-    w = p[3] + s * (q[3] - p[3])
-    if w <= 0:
-        return np.nan, np.nan
-    return (p[axis] + s * (q[axis] - p[axis])) / w, (p[2] + s * (q[2] - p[2])) / w
+    w = corners[i, 3] + s * (corners[j, 3] - corners[i, 3])
+    crosses = (a > 0) != (b > 0) and not w <= 0
+    at = (corners[i, axis] + s * (corners[j, axis] - corners[i, axis])) / w if crosses else np.nan
+    return at, (corners[i, 2] + s * (corners[j, 2] - corners[i, 2])) / w if crosses else np.nan
 
 
 @compiled
 def _turns(corners, i, j, far, axis, way):
     """True if a triangle with a `far` corner does not lie ahead of its edge, on a way along an axis."""
-    p, q, r = corners[i], corners[j], corners[far]
-    a, b, c = p[1] * q[3] - p[3] * q[1], p[3] * q[0] - p[0] * q[3], p[0] * q[1] - p[1] * q[0]
+    a = corners[i, 1] * corners[j, 3] - corners[i, 3] * corners[j, 1]
+    b = corners[i, 3] * corners[j, 0] - corners[i, 0] * corners[j, 3]
+    c = corners[i, 0] * corners[j, 1] - corners[i, 1] * corners[j, 0]
     ahead = way * (a if axis == 0 else b)
-    return (a * r[0] + b * r[1] + c * r[3]) * ahead <= 0
+    return (a * corners[far, 0] + b * corners[far, 1] + c * corners[far, 3]) * ahead <= 0
 
 
 @compiled
@@ -77,7 +51,7 @@ def _walk(corners, tri, beyond, start, goal, x, y, axis, way, end):
     Args:
         corners: (V, 4).
         tri: (T, 3).
-        beyond: (T, 3), the result of `neighbours`.
+        beyond: (T, 3), `Topology.beyond`.
         start: the triangle at (x, y).
         goal: the triangle at the next centre, or −1.
         x: of the pixel's centre.
@@ -138,7 +112,7 @@ def find(first, last, corners, tri, beyond, shown, begins, found):
         last: the line after the last.
         corners: (B, V, 4), or (1, V, 4) for all images.
         tri: (T, 3).
-        beyond: (T, 3), the result of `neighbours`.
+        beyond: (T, 3), `Topology.beyond`.
         shown: (B, H, W) int32, the number plus one of the triangle that each pixel shows, or 0.
         begins: (B · H + 1,), where the ways of each line begin.
         found: (M, 5) int32 to fill: the pixel whose surface ends, and the other one, as flat indices; 0 for a way along

@@ -33,10 +33,13 @@ class Topology:
     @functools.cached_property
     def beyond(self) -> np.ndarray:
         """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 for none, or several."""
-        from rts_nvdiffrast.outlines_loops import neighbours
-
         edges = np.sort(self.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
-        return neighbours(self.faces, np.lexsort((edges[:, 1], edges[:, 0])))
+        order = np.lexsort((edges[:, 1], edges[:, 0]))
+        alike = np.append((edges[order[1:]] == edges[order[:-1]]).all(1), False)
+        pairs = np.flatnonzero(alike & ~np.roll(alike, 1) & ~np.roll(alike, -1))
+        found = np.full(3 * len(self.faces), -1, np.int32)
+        found[order[pairs]], found[order[pairs + 1]] = order[pairs + 1] // 3, order[pairs] // 3
+        return found.reshape(-1, 3)
 
 
 @functools.lru_cache(maxsize=8)

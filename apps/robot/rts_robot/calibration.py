@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
 
 import rts
 from rts.plugin_api.checks import check_numbers, quoted
@@ -163,7 +164,8 @@ class _Problem:
         loss: rts.Loss,
     ):
         self.size = masks.shape[1:]
-        self.camera = rts.Camera.from_opencv(intrinsics, _rotation(view[:3, :3]), view[:3, 3], self.size)
+        turn = Rotation.from_matrix(view[:3, :3]).as_matrix()  # The nearest one: matrices of files are rounded.
+        self.camera = rts.Camera.from_opencv(intrinsics, turn, view[:3, 3], self.size)
         placed = np.stack([np.stack([np.asarray(x) for x in robot.transforms(q)]) for q in values])
         self.middle = placed[:, [mesh.link for mesh in robot.meshes], :3, 3].mean(axis=(0, 1))
         self.chosen = np.array([[name == other for other in robot.names] for name in offsets], np.float64)
@@ -219,12 +221,6 @@ class _Problem:
         change[:6, :6] = -np.eye(6)
         change[3:6, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
         return change @ covariance @ change.T
-
-
-def _rotation(matrix: np.ndarray) -> np.ndarray:
-    """The nearest rotation: matrices of files are rounded."""
-    left, _, right = np.linalg.svd(matrix)
-    return left @ right
 
 
 def _iou(parts: list[rts.Part], camera: rts.Camera, mask: np.ndarray) -> float:
