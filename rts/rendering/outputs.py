@@ -9,7 +9,7 @@ from typing import Any
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import shape_of, unit
-from rts.arrays.engines import namespace, stopped
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
@@ -98,8 +98,6 @@ class Outputs:
         Raises:
             InputError: no part has "uv"; or an attribute has other numbers of channels in some parts.
         """
-        xp, alpha, outputs, first = namespace(image), image[..., -1:], {}, channels
-        covered = alpha >= LEAST_ALPHA
         for name in self.means:
             widths = self._widths[name]
             if not widths:
@@ -108,11 +106,17 @@ class Outputs:
                 raise InputError(
                     f"the attribute {name!r} has {sorted(widths)} numbers a sample, by part; expected as many in all"
                 )
-            (width,) = widths
-            mean = xp.where(covered, image[..., first : first + width] / xp.where(covered, alpha, 1.0), 0.0)
-            outputs[name] = _unit_or_zero(mean) if name == "normal" else mean
-            first += width
-        outputs |= {"color": xp.concat([image[..., :channels], alpha], axis=-1), "alpha": alpha}
+        xp, outputs = namespace(image), {}
+        # Cut at once: the derivative of a slice is an array as large as the image.
+        sizes = channels, *(next(iter(self._widths[name])) for name in self.means), 1
+        pieces = engine_of(image).split(xp.moveaxis(image, -1, 0), sizes)
+        color, *means, alpha = (xp.moveaxis(piece, 0, -1) for piece in pieces)
+        covered = alpha >= LEAST_ALPHA
+        for name, piece in zip(self.means, means, strict=True):
+            # The mean of normals of length 1; other means are shares of what is covered.
+            size = _length(piece) if name == "normal" else alpha
+            outputs[name] = piece * xp.where(covered, 1 / xp.where(covered, size, 1.0), 0.0)
+        outputs |= {"color": xp.concat([color, alpha], axis=-1), "alpha": alpha}
         outputs |= zip(self.fronts, fronts, strict=True)
         return {name: outputs[name] for name in self.names}
 
@@ -206,11 +210,11 @@ def _front_depth(splats: Splats) -> Array:
     return depth
 
 
-def _unit_or_zero(x: Array) -> Array:
-    """Vectors (..., 3) of length 1; those that are zero stay zero."""
+def _length(x: Array) -> Array:
+    """The lengths (..., 1) of vectors (..., 3); 1 for those that are zero."""
     xp = namespace(x)
     square = xp.sum(x * x, axis=-1, keepdims=True)
-    return x / xp.sqrt(xp.where(square > 0, square, 1.0))
+    return xp.sqrt(xp.where(square > 0, square, 1.0))
 
 
 def _unknown(name: str, gbuffer: GBuffer) -> str:
