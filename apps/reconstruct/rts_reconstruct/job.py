@@ -28,7 +28,10 @@ def first() -> bool:
 
 
 def shared(function: Callable[[], Any]) -> Any:
-    """The result of a function that the first process alone calls."""
+    """The result of a function that the first process alone calls.
+
+    The function may not fit to views: processes share those, and this one would wait for the others.
+    """
     if not torch.distributed.is_initialized():
         return function()
     results = [function() if first() else None]

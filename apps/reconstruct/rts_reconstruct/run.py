@@ -112,7 +112,7 @@ class Run:
         fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
         fit = fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces)))
         if self.settings.cameras:
-            fit = job.shared(lambda: posing.refined(fit, self.pictures, self.settings))
+            fit = posing.refined(fit, self.pictures, self.settings)
         self._keep(fit, losses)
 
     def texture(self, number: int, size: int, steps: int) -> None:
@@ -163,7 +163,7 @@ class Run:
             self.model = job.shared(lambda: texturing.in_even_light(self.model))
         rows = measures.measured(self.model, self.pictures)
         unseen = sight.unseen_share(self.model, known)
-        told = job.shared(lambda: verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings))
+        told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
         found = Reconstruction(self.model, self.pictures, rows, psnr, self.seconds, [], told)

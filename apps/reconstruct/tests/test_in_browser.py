@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from rts_reconstruct import files, measures, pictures, report
 from rts_reconstruct.model import Model
+from rts_reconstruct.verdict import Verdict
 from seen_ellipsoid import SIZE, ellipsoid, images, views
 
 import rts
@@ -39,17 +40,19 @@ def test_the_report_shows_pictures_differences_losses_and_measures(tmp_path):
     rows = measures.measured(model, found)
     files.write_turntable(tmp_path / "turntable.gif", model, found)
     losses = [[1.0, 0.5, 0.2], [0.3, 0.1]]
-    report.write_report(tmp_path / "report.html", model, found, rows, losses, "42 <faces>")
+    told = Verdict(False, "overlap 0.9", ("b.png: look at <light>",))
+    report.write_report(tmp_path / "report.html", model, found, rows, losses, "42 <faces>", told)
     with Browser(f"file://{tmp_path}/report.html", tmp_path / "profile") as browser:
         until(lambda: "Measures" in browser.text(), 60)
         loaded = until(lambda: (seen := browser.run(LOADED)) and all(seen) and seen, 30)
         assert len(loaded) == 1 + 3 * 2  # The turntable, and a picture, a render and a difference of two views.
-        assert "42 <faces>" in browser.text() and "PSNR, dB" in browser.text()
+        assert all(words in browser.text() for words in ("42 <faces>", "PSNR, dB", *told.findings))
         assert browser.run(FETCHED) == 0
+        browser.run("document.images[1].scrollIntoView()")
         first = browser.picture()
         browser.run("document.querySelector('svg').scrollIntoView()")
         second = browser.picture()
-    Image.fromarray(first).save(tmp_path / "report_top.png")
+    Image.fromarray(first).save(tmp_path / "report_views.png")
     Image.fromarray(second).save(tmp_path / "report_end.png")
     assert share(first, (128, 128, 128)) > 0.02  # A difference, which is grey where there is none.
     assert (np.abs(first[..., 0].astype(int) - first[..., 2]) > 60).mean() > 0.005  # The ends are red and blue.
