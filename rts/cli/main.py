@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -53,8 +52,6 @@ app = typer.Typer(
 
 def main() -> None:
     """The entry point `rts`."""
-    # Idle OpenMP threads of torch and numba would spin, and take the processor from others.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     app(prog_name="rts")
 
 

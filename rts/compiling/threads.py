@@ -19,6 +19,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+TORCH_SPINS = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
+"""Whether torch was imported before rts: its idle OpenMP threads then spin, on cores that loops could use."""
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Read where torch is imported, or another user of OpenMP.
+
 TASKS_PER_THREAD = 4
 """Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""
 

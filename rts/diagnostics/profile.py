@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import is_constant
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.compiling.threads import TORCH_SPINS
 from rts.contracts.checks import check_splatter, is_count
 from rts.contracts.records import Sampled
 from rts.errors import InputError
@@ -39,6 +40,10 @@ HINTS = {
     BACKWARD: "only torch and jax arrays are differentiated: leave what is not fitted in NumPy",
 }
 """Advice for the stage that takes most."""
+
+SPINNING = (
+    "\nTorch was imported before rts: its idle threads take cores. Import rts first, or set OMP_WAIT_POLICY=PASSIVE."
+)
 
 
 class Stage(NamedTuple):
@@ -81,7 +86,8 @@ class Profile(NamedTuple):
         lines.append(f"{'':20}{sum(stage.first for stage in self.stages):>12.1f}{total:>12.2f}")
         longest = max(self.stages, key=lambda stage: stage.later).name
         parts = "1 part" if self.parts == 1 else f"{self.parts} parts"
-        return "\n".join([*lines, f"{parts}. Most time: {longest}; {self.hint}."])
+        late = SPINNING if TORCH_SPINS else ""
+        return "\n".join([*lines, f"{parts}. Most time: {longest}; {self.hint}.{late}"])
 
 
 def profile(

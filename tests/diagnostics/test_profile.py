@@ -1,5 +1,9 @@
 """Where the time of a render goes."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -36,3 +40,21 @@ def test_without_derivatives_there_is_no_gradient():
     with pytest.raises(rts.InputError, match="repeats is 0"):
         rts.profile(mesh_part(icosphere(1)), CAMERA, (16, 16), repeats=0)
     assert np.isfinite([stage.later for stage in found.stages]).all()
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "policy"), [("rts", "torch", ""), ("torch", "rts", ""), ("torch", "rts", "ACTIVE")]
+)
+def test_torch_is_asked_not_to_spin_unless_it_came_first(first, then, policy):
+    pytest.importorskip("torch")
+    program = f"""
+import {first}, {then}, os
+from rts.diagnostics import profile
+text = str(profile.Profile((profile.Stage("splat", 1.0, 1.0, 1, 1.0),), 1, ""))
+print(os.environ["OMP_WAIT_POLICY"], "Import rts first" in text)
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {"OMP_WAIT_POLICY": policy} if policy else {}
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    late = first == "torch" and not policy
+    assert run.stdout.split() == [policy or "PASSIVE", str(late)], run.stderr
