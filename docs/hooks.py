@@ -55,9 +55,8 @@ def listed(nav):
 def commands():
     """A page in Markdown: each command of `rts`, with its options, as `--help` has them."""
     import typer
-    from typer.cli import get_docs_for_click
-
     from rts.cli.main import app
+    from typer.cli import get_docs_for_click
 
     group = typer.main.get_command(app)
     text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="rts")

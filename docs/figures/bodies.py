@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-
 import rts
 
 IMAGES = Path(__file__).parents[1] / "images"

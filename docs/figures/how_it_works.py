@@ -12,12 +12,11 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import rts
 import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.path import Path as Outline
-
-import rts
 
 IMAGES = Path(__file__).parents[1] / "images/how-it-works"
 INK, PALE, GRID = "#1f2937", "#6b7280", "#d1d5db"

@@ -6,9 +6,8 @@ python docs/figures/lights_and_materials.py
 from pathlib import Path
 
 import numpy as np
-import trimesh
-
 import rts
+import trimesh
 from rts.shading import prefiltered
 
 IMAGES = Path(__file__).parents[1] / "images"

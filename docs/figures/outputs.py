@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-
 import rts
 
 IMAGE = Path(__file__).parents[1] / "images/outputs.png"

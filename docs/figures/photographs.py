@@ -11,9 +11,8 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import zoom
-
 import rts
+from scipy.ndimage import zoom
 
 IMAGES = Path(__file__).parents[1] / "images"
 SPOT = Path(os.environ.get("RTS_DATA", Path(__file__).parents[3] / "shared" / "data")) / "meshes" / "spot"

@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import rts
 from rts_robot import calibrate
 from rts_robot.report import overlay
-
-import rts
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))

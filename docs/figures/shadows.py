@@ -6,10 +6,9 @@ python docs/figures/shadows.py
 from pathlib import Path
 
 import numpy as np
+import rts
 import torch
 import trimesh
-
-import rts
 
 IMAGES = Path(__file__).parents[1] / "images"
 CAMERA = rts.Camera.look_at((1.6, 3.2, 5.2), (0, 0.1, 0), fov_y=36)

@@ -10,11 +10,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 from rts.shading import prefiltered, turned_environment
 
 quick = "RTS_QUICK" in os.environ

@@ -7,11 +7,10 @@
 import os
 
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count = ((32, 32), 30) if quick else ((96, 96), 400)

@@ -8,10 +8,9 @@
 import os
 
 import numpy as np
+import rts
 import torch
 from PIL import Image
-
-import rts
 from rts.plugin_api.arrays import namespace
 from rts.plugin_api.bases import GBuffer, RaySurface
 from rts.plugin_api.records import RayHits

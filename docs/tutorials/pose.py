@@ -8,11 +8,10 @@
 import os
 
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 
 size = (48, 48) if "RTS_QUICK" in os.environ else (192, 192)
 

@@ -9,11 +9,10 @@
 import os
 
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count, width = ((24, 24), 15, 16) if quick else ((64, 64), 120, 32)

@@ -8,11 +8,10 @@
 import os
 
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count, detail = ((32, 32), 12, 2) if quick else ((96, 96), 150, 4)

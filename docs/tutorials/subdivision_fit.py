@@ -9,10 +9,9 @@
 import os
 
 import numpy as np
+import rts
 import torch
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count = ((32, 32), 4) if quick else ((128, 128), 12)

@@ -8,10 +8,9 @@
 import os
 
 import numpy as np
+import rts
 import torch
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count = ((40, 40), 15) if quick else ((96, 96), 100)

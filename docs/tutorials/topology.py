@@ -8,10 +8,9 @@
 import os
 
 import numpy as np
+import rts
 import torch
 from PIL import Image
-
-import rts
 
 quick = "RTS_QUICK" in os.environ
 size, count, points = ((24, 24), 15, 12) if quick else ((64, 64), 200, 24)

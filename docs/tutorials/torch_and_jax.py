@@ -9,11 +9,10 @@ import os
 
 import jax
 import numpy as np
+import rts
 import torch
 import trimesh
 from PIL import Image
-
-import rts
 
 size = (24, 24) if "RTS_QUICK" in os.environ else (192, 192)
 ring = trimesh.creation.torus(0.8, 0.35, major_sections=24, minor_sections=12)
