@@ -34,7 +34,7 @@ SIZES, STEPS, POSE_STEPS, POSE_SIZE = (4, 8, 16), 1000, 1000, 64
 POSES = 6
 """Poses in which gradients are compared."""
 GRADIENT_STEP = 2e-4
-"""Of their differences, in radians and units of space; a unit is some 90 pixels."""
+"""The step of their differences, in radians and units of space; a unit is some 90 pixels."""
 CLOSE = 1.0
 """Degrees within which a pose counts as found."""
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32) - 0.5

@@ -161,7 +161,7 @@ def coverage(robot: Robot, scenes: int, chosen: list[str], kept: Path) -> None:
 
 
 def whole(robot: Robot, scenes: int, chosen: list[str], kept: Path) -> None:
-    """Print the same of whole fits at full size, one a scene. Their results are kept in a folder."""
+    """Print how often intervals of whole fits at full size hold the truth, a fit a scene. A folder keeps results."""
     kept.mkdir(parents=True, exist_ok=True)
     for kind in chosen:
         rows = []
