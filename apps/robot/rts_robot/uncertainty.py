@@ -9,8 +9,10 @@ import torch
 
 import rts
 
-BLOCKS = 16
-"""Blocks along the longer side of a picture."""
+BLOCKS = 10
+"""Blocks along the longer side of the pixels that change."""
+GRIDS = 4
+"""Ways to cut them into blocks."""
 STEP = 1e-3
 """Step of differences of a loss's slope, in units of residuals."""
 UNDETERMINED = 1e-6
@@ -26,11 +28,12 @@ def covariance_of(
 ) -> np.ndarray:
     """The covariance (U, U) of parameters at the minimum of a loss, by a jackknife over blocks of pixels.
 
-    Residuals of neighbours are alike, and those of wrong pixels are large, so the inverse of JᵀJ times their mean
-    square is too small. Instead a block of pixels at a time is left out, and the parameters move by (H − H_b)⁻¹ g_b, to
-    first order: H is the loss's second derivative, g_b the slope of the block's share. The covariance is (n − 1) / n
-    times the sum of the squares of these moves over n blocks, the mean for four grids of blocks. It is Efron's
-    jackknife, close to the sandwich estimate for clustered residuals (CR3).
+    Residuals of neighbours are alike, those of wrong pixels are large, and a base that stands still has the same
+    residuals in every view. So the inverse of JᵀJ times their mean square is too small. Instead a block of pixels at a
+    time is left out of all views, and the parameters move by (H − H_b)⁻¹ g_b, to first order: H is the loss's second
+    derivative, g_b the slope of the block's share. The covariance is (n − 1) / n times the sum of the squares of these
+    moves over n blocks, the mean for four grids of blocks. It is Efron's jackknife, close to the sandwich estimate for
+    clustered residuals (CR3).
 
     Args:
         residuals: parameters (U,), number of a view → (H, W).
@@ -42,48 +45,40 @@ def covariance_of(
     Raises:
         rts.InputError: the residuals do not tell the parameters apart.
     """
-    moments = [_moments(residuals, parameters, number, loss) for number in range(views)]
-    # Sums over blocks for each grid, of all views.
-    grids = [
-        tuple(np.concatenate(sums) for sums in zip(*of_views, strict=True)) for of_views in zip(*moments, strict=True)
-    ]
-    hessian = grids[0][1].sum(axis=0)
+    engine, moments = rts.engine_of(parameters), []
+    for number in range(views):
+        image, rows = engine.jacobian(lambda v, number=number: residuals(v, number))(parameters)
+        r, jacobian = image.double(), rows.double().numpy()
+        y, x = np.nonzero(np.abs(jacobian).sum(axis=0))
+        j = jacobian[:, y, x].T
+        curved = (_slope(r + STEP, loss) - _slope(r - STEP, loss)) / (2 * STEP)
+        second = curved[y, x, None, None] * j[:, :, None] * j[:, None]
+        moments.append((y, x, _slope(r, loss)[y, x, None] * j, second))
+    y, x, first, second = (np.concatenate(of_views) for of_views in zip(*moments, strict=True))
+    hessian = second.sum(axis=0)
     _refuse_open(hessian, names)
     total = np.zeros_like(hessian)
-    for slopes, curvatures in grids:
+    for block in _blocks(y - y.min(), x - x.min()):
+        count = block.max() + 1
+        slopes, curvatures = np.zeros((count, *first.shape[1:])), np.zeros((count, *second.shape[1:]))
+        np.add.at(slopes, block, first)
+        np.add.at(curvatures, block, second)
         moves = np.linalg.solve(hessian - curvatures, slopes[..., None])[..., 0]
-        total += moves.T @ moves * (len(moves) - 1) / len(moves)
-    return total / len(grids)
+        total += moves.T @ moves * (count - 1) / count
+    return total / GRIDS
 
 
-def _moments(
-    residuals: Callable[[torch.Tensor, int], torch.Tensor], parameters: torch.Tensor, number: int, loss: rts.Loss
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Sums over the blocks of a view, for each grid: slopes (n, U) and second derivatives (n, U, U) of the loss."""
-    engine = rts.engine_of(parameters)
-    image, rows = engine.jacobian(lambda v: residuals(v, number))(parameters)
-    r, jacobian = image.double(), rows.double().numpy()
+def _slope(r: torch.Tensor, loss: rts.Loss) -> np.ndarray:
+    """The derivative of the loss of each residual."""
+    return (loss.weights(r)[0] * r).numpy()
 
-    def slope(x: torch.Tensor) -> torch.Tensor:
-        return loss.weights(x)[0] * x
 
-    first = slope(r).numpy()
-    second = ((slope(r + STEP) - slope(r - STEP)) / (2 * STEP)).numpy()
-    y, x = np.nonzero(np.abs(jacobian).sum(axis=0))
-    j = jacobian[:, y, x].T
-    slopes, curvatures = first[y, x, None] * j, second[y, x, None, None] * j[:, :, None] * j[:, None]
-    side = -(-max(r.shape) // BLOCKS)
-    half, grids = side // 2, []
-    for top, left in ((0, 0), (half, 0), (0, half), (half, half)):
-        _, block = np.unique(((y + top) // side) * (2 * BLOCKS) + (x + left) // side, return_inverse=True)
-        sums = (
-            np.zeros((block.max(initial=-1) + 1, len(parameters))),
-            np.zeros((block.max(initial=-1) + 1, *2 * (len(parameters),))),
-        )
-        np.add.at(sums[0], block, slopes)
-        np.add.at(sums[1], block, curvatures)
-        grids.append(sums)
-    return grids
+def _blocks(y: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
+    """The block of each pixel, numbered from 0 on, in each grid: grids are half a block apart."""
+    side = max(y.max(), x.max()) // BLOCKS + 1
+    corners = ((0, 0), (side // 2, 0), (0, side // 2), (side // 2, side // 2))
+    places = (((y + top) // side) * 2 * BLOCKS + (x + left) // side for top, left in corners)
+    return [np.unique(place, return_inverse=True)[1] for place in places]
 
 
 def _refuse_open(hessian: np.ndarray, names: Sequence[str]) -> None:

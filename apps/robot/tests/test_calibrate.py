@@ -70,16 +70,21 @@ def test_residuals_without_correlation_have_the_variance_of_a_mean():
     from rts_robot.uncertainty import covariance_of
 
     rng = np.random.default_rng(0)
-    data = torch.tensor(rng.normal(size=(3, 64, 64)))
-    mean, loss = torch.tensor([0.0], dtype=torch.float64), rts.Loss()
+    draws = torch.tensor(rng.normal(size=(8, 3, 64, 64)))
+    mean, loss, pixels = torch.tensor([0.0], dtype=torch.float64), rts.Loss(), 3 * 64 * 64
 
-    def variance(data):
-        return covariance_of(lambda p, view: p[0] - data[view], mean, 3, loss, ["mean"])[0, 0]
+    def variance(draws):
+        of_draws = [
+            covariance_of(lambda p, n, data=data: p[0] - data[n], mean, 3, loss, ["mean"])[0, 0] for data in draws
+        ]
+        return np.mean(of_draws)
 
-    assert variance(data) == pytest.approx(1 / data.numel(), rel=0.15)
+    assert variance(draws) == pytest.approx(1 / pixels, rel=0.15)
     # Squares of 2 × 2 equal pixels: four times as much.
-    coarse = data[:, ::2, ::2].repeat_interleave(2, 1).repeat_interleave(2, 2)
-    assert variance(coarse) == pytest.approx(4 / data.numel(), rel=0.25)
+    coarse = draws[..., ::2, ::2].repeat_interleave(2, -1).repeat_interleave(2, -2)
+    assert variance(coarse) == pytest.approx(4 / pixels, rel=0.25)
+    # The same pixels in all three views: three times as much.
+    assert variance(draws[:, :1].expand(-1, 3, -1, -1)) == pytest.approx(3 / pixels, rel=0.15)
 
 
 def test_the_variance_of_a_robust_mean_is_that_of_repeated_draws():
