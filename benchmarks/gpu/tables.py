@@ -58,8 +58,8 @@ def torch_step(task: Task, mode: str, device: str) -> dict[str, Callable[[], Any
     """The stages of an iteration with torch, in their order; each works on what the one before left."""
     import torch
 
-    pose = torch.tensor(START, device=device, requires_grad=True)
-    vertices = torch.tensor(task.vertices, device=device, requires_grad=mode == "full")
+    pose = torch.tensor(START).to(device).requires_grad_()
+    vertices = torch.tensor(task.vertices).to(device).requires_grad_(mode == "full")
     target = torch.from_numpy(task.target).to(device)
     optimizer = torch.optim.Adam([{"params": [pose], "lr": RATE}])
     options: dict[str, Any] = {"splatter": task.splatter, "layers": task.layers}
