@@ -137,7 +137,7 @@ def main() -> None:
     entered: Any = contextlib.nullcontext()
     if options.device == "stand-in":
         sys.path.append(str(ROOT / "tests"))
-        import elsewhere
+        import elsewhere  # pyright: ignore[reportMissingImports]  # It lies among the tests.
 
         entered, options.device = elsewhere.Device(), elsewhere.DEVICE.type
     columns, found = [], []

@@ -156,7 +156,7 @@ def counted(stages: dict[str, Callable[[], Any]], device: str) -> dict[str, Any]
         if "synchron" in str(warning.message):
             line = f"{Path(warning.filename).name}:{warning.lineno}"
             waits[line] = waits.get(line, 0) + 1
-    names = [event.name for event in profile.events() if "cuda" in str(event.device_type).lower()]
+    names = [event.name for event in profile.events() or () if "cuda" in str(event.device_type).lower()]
     return {
         "kernels": len([n for n in names if not n.startswith("Mem")]),
         "copies": len([n for n in names if n.startswith("Memcpy")]),

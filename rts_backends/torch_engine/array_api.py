@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # Names of torch, such as `int`, hide those of Python here.
 
+from typing import Any
+
 from array_api_compat import torch as _compat
 from array_api_compat.torch import *  # noqa: F403  # pyright: ignore[reportWildcardImportFromLibrary]
 from torch import Tensor, clamp
@@ -12,6 +14,6 @@ def take(x: Tensor, indices: Tensor, /, *, axis: int | None = None) -> Tensor:
     return _compat.take(x, indices.long(), axis=axis)
 
 
-def clip(x: Tensor, /, min: float | Tensor | None = None, max: float | Tensor | None = None) -> Tensor:
+def clip(x: Tensor, /, min: Any = None, max: Any = None) -> Tensor:
     """`x` between bounds, which are not NaN: of sizes, `torch.compile` cannot ask this, and array_api_compat does."""
     return clamp(x, min, max)

@@ -107,8 +107,8 @@ def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> 
 
     Slopes are means of the differences from and to the next cells of the same layers.
     """
-    xp, there, at = namespace(rgba), row >= 0, centres(*row.shape[1:], rgba)
-    cells = Stack.of(positions, rgba, row, at[None, ...])
+    xp, there, (height, width) = namespace(rgba), row >= 0, row.shape[1:]
+    cells = Stack.of(positions, rgba, row, centres(height, width, rgba)[None, ...])
     color, total, (through, behind) = stopped(cells.color), 0.0, cells.weights()
     for axis in (0, 1):
         here = (joined[axis, ...][None, ...] & there & xp.roll(there, -1, axis=2 - axis))[..., None]
