@@ -16,4 +16,6 @@ def take(x: Tensor, indices: Tensor, /, *, axis: int | None = None) -> Tensor:
 
 def clip(x: Tensor, /, min: Any = None, max: Any = None) -> Tensor:
     """`x` between bounds, which are not NaN: of sizes, `torch.compile` cannot ask this, and array_api_compat does."""
+    if isinstance(min, Tensor) or isinstance(max, Tensor):
+        return _compat.clip(x, min, max)
     return clamp(x, min, max)

@@ -33,6 +33,7 @@ def bytes_by_name(found):
     return sums
 
 
+@pytest.mark.thorough
 def test_samples_and_breaks_cross_by_their_sizes(step):
     sums, cells = bytes_by_name(step), (SIDE + 4) ** 2
     assert sums["to the device", "row"] == sums["to the host", "row"] == 4 * cells
@@ -44,6 +45,7 @@ def test_samples_and_breaks_cross_by_their_sizes(step):
     assert sums["to the host", "vertices"] == 12 * len(VERTICES)
 
 
+@pytest.mark.thorough
 def test_every_crossing_has_a_name_and_faces_cross_once(step):
     known = {name for names in crossings.ORDER.values() for name in names} | {crossings.NUMBERS}
     assert set(crossings.names(step)) <= known

@@ -13,7 +13,8 @@ from rts.rendering.splats import to_splats
 from rts.sampling.scene import Scene
 
 torch = pytest.importorskip("torch")
-pytestmark = [pytest.mark.splatting, pytest.mark.thorough]
+pytestmark = pytest.mark.splatting
+thorough = pytest.mark.thorough
 
 SIZES = (22, 26), (24, 20), (30, 34)
 BALL, FACES = icosphere(2)
@@ -48,6 +49,7 @@ def with_gradients(image, found):
     return picture.detach(), *torch.autograd.grad((picture * weights).sum(), (positions, rgba))
 
 
+@thorough
 @pytest.mark.parametrize("splatter", ["edges", "multi"])
 def test_it_is_one_graph_for_three_sizes(splatter):
     torch._dynamo.reset()
@@ -65,6 +67,7 @@ def test_it_is_one_graph_for_three_sizes(splatter):
     assert len(graphs) == 1
 
 
+@thorough
 @pytest.mark.parametrize("splatter", ["edges", "multi"])
 def test_inductor_computes_what_the_loops_compute(splatter):
     torch._dynamo.reset()
