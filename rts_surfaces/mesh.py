@@ -177,5 +177,5 @@ class Mesh(TriangleSurface):
         faces = engine.constant(table, vertices)
         a, b, c = (take(vertices, faces[:, i]) for i in range(3))
         face_normals = xp.linalg.cross(b - a, c - a)
-        segments = table.T.reshape(-1)
+        segments = xp.reshape(faces.T, (-1,))
         return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))

@@ -58,8 +58,8 @@ def torch_step(task: Task, mode: str, device: str) -> dict[str, Callable[[], Any
     """The stages of an iteration with torch, in their order; each works on what the one before left."""
     import torch
 
-    pose = torch.tensor(START, device=device, requires_grad=True)
-    vertices = torch.tensor(task.vertices, device=device, requires_grad=mode == "full")
+    pose = torch.tensor(START).to(device).requires_grad_()
+    vertices = torch.tensor(task.vertices).to(device).requires_grad_(mode == "full")
     target = torch.from_numpy(task.target).to(device)
     optimizer = torch.optim.Adam([{"params": [pose], "lr": RATE}])
     options: dict[str, Any] = {"splatter": task.splatter, "layers": task.layers}
@@ -156,7 +156,7 @@ def counted(stages: dict[str, Callable[[], Any]], device: str) -> dict[str, Any]
         if "synchron" in str(warning.message):
             line = f"{Path(warning.filename).name}:{warning.lineno}"
             waits[line] = waits.get(line, 0) + 1
-    names = [event.name for event in profile.events() if "cuda" in str(event.device_type).lower()]
+    names = [event.name for event in profile.events() or () if "cuda" in str(event.device_type).lower()]
     return {
         "kernels": len([n for n in names if not n.startswith("Mem")]),
         "copies": len([n for n in names if n.startswith("Memcpy")]),

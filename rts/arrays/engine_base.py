@@ -43,6 +43,10 @@ class Engine(Plugin):
         Floats take the dtype of `like`; without it the engine's default, such as float32.
         """
 
+    def arange(self, count: int, like: Array) -> Array:
+        """The numbers (count,) from 0 on, in the dtype of `like`, which is floating, and on its device."""
+        return self.constant(np.arange(float(count)), like)
+
     @abc.abstractmethod
     def call_host(self, fn: Callable, specs: Sequence[Any], *args: Array) -> tuple[Array, ...]:
         """Call `fn` on NumPy views or copies of `args`; the results carry no derivative and live where `args` do.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from operator import attrgetter
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -118,9 +117,10 @@ class _OnCells:
 
     cells: Cells
 
-    row = property(attrgetter("cells.row"), doc="See `Cells`.")
-    depth = property(attrgetter("cells.depth"), doc="See `Cells`.")
-    triangle = property(attrgetter("cells.triangle"), doc="See `Cells`.")
+    # `torch.compile` traces functions, not `operator.attrgetter`.
+    row = property(lambda self: self.cells.row, doc="See `Cells`.")
+    depth = property(lambda self: self.cells.depth, doc="See `Cells`.")
+    triangle = property(lambda self: self.cells.triangle, doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed; fields of `cells` may be named directly."""

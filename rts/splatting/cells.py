@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rts.arrays.engines import namespace
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.arrays.value_ranges import value_range
 from rts.errors import InputError
@@ -26,6 +26,13 @@ def nothing(rgba: Array, row: Array) -> Array:
     check_rows(row, 0)
     xp = namespace(rgba, row)
     return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * rgba.shape[1], axis=-1)
+
+
+def centres(height: int, width: int, like: Array) -> Array:
+    """Centres (H, W, 2) of cells, x and y, in the dtype of `like` and on its device."""
+    xp, engine = namespace(like), engine_of(like)
+    down, across = xp.meshgrid(engine.arange(height, like), engine.arange(width, like), indexing="ij")
+    return xp.stack([across, down], axis=-1) + 0.5
 
 
 def unpack(values: Array, cells: Array) -> Array:

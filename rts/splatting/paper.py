@@ -13,11 +13,8 @@ derivatives (a Hessian) do not.
 from __future__ import annotations
 
 import abc
-import functools
 import math
 from dataclasses import dataclass
-
-import numpy as np
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import engine_of, namespace, stopped
@@ -81,7 +78,7 @@ class Kernel(Splatter):
         if self.calibration is not None and not (is_real(self.calibration) and 0 < self.calibration < math.inf):
             raise InputError(f"calibration is {quoted(self.calibration)}; expected a positive number, or None")
 
-    @functools.cached_property
+    @property
     def gamma(self) -> float:
         """The calibration as a number."""
         return exact_calibration(self.sigma) if self.calibration is None else self.calibration
@@ -110,8 +107,8 @@ class Kernel(Splatter):
 
     def _weights(self, position: Array, count: int, down: bool = False) -> dict[int, Array]:
         """Factors of w(u, v) along one axis, by offset, of positions along it."""
-        centre = np.arange(-1, count + 1) + 0.5
-        centre = engine_of(position).constant(centre[:, None] if down else centre, position)
+        centre = engine_of(position).arange(count + 2, position) - 0.5
+        centre = centre[:, None] if down else centre
         offset, scale = self.gamma * (position - centre), 1 / (2 * self.sigma**2)
         peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         return {u: peak * namespace(position).exp(-((u - offset) ** 2) * scale) for u in OFFSETS}

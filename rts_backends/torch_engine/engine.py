@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -31,6 +32,14 @@ _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, tor
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
 
+_sent: dict[tuple[int, torch.device], tuple[weakref.ref, torch.Tensor]] = {}
+"""Read-only tables of the host by identity and device, and their tensors there."""
+
+
+def _is_fixed(array: np.ndarray) -> bool:
+    """True for a read-only array that owns its memory, whose numbers stay."""
+    return array.flags.owndata and not array.flags.writeable
+
 
 class TorchEngine(Engine):
     """Engine of torch tensors."""
@@ -43,14 +52,28 @@ class TorchEngine(Engine):
         return isinstance(x, torch.Tensor)
 
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
-        """`value` on the device of `like`, else on the CPU; floats as float64 if `like` is, else as float32."""
+        """`value` on the device of `like`, else on the CPU; floats as float64 if `like` is, else as float32.
+
+        Read-only tables of integers, such as a mesh's faces, are sent to a device once, and kept as long as they live.
+        """
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
         if array.dtype != dtype and array.dtype.kind == "f":
             # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
                 array = array.astype(dtype)
-        return to_tensor(array, None if like is None else like.device)
+        device = None if like is None else like.device
+        if device is None or device.type == "cpu" or array.dtype.kind != "i" or not _is_fixed(array) or transformed():
+            return to_tensor(array, device)
+        key = id(array), device
+        kept = _sent.get(key)
+        if kept is None or kept[0]() is not array:
+            kept = _sent[key] = weakref.ref(array, lambda _: _sent.pop(key, None)), to_tensor(array, device)
+        return kept[1]
+
+    def arange(self, count: int, like: torch.Tensor) -> torch.Tensor:
+        """See `Engine.arange`: made on the device."""
+        return torch.arange(count, dtype=like.dtype, device=like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`, without derivative.

@@ -21,7 +21,6 @@ Where light passes through, C and the colours on both sides of a break are compo
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
-from rts.splatting.cells import check_rows, nothing, unpack
+from rts.splatting.cells import centres, check_rows, nothing, unpack
 from rts.splatting.edges import weights as edges_weights
 from rts.splatting.edges.stacks import CELLS, Operands
 from rts.splatting.edges.weights import BORDER
@@ -39,7 +38,10 @@ from rts.splatting.edges.weights import BORDER
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
 """The fields of outlines that the operation takes: those of one layer."""
 
-_fields_of = attrgetter(*FIELDS)
+
+def _fields_of(outlines: Outlines) -> list[Array]:
+    return [getattr(outlines, name) for name in FIELDS]
+
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
@@ -135,17 +137,16 @@ def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) ->
     cells = xp.concat([y * width + x for x, y, _ in parts])
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
-    return image + xp.reshape(sums, image.shape)
+    # Inductor of torch 2.13, with free sizes, reads sums in another shape before it has made them.
+    return xp.reshape(xp.reshape(image, sums.shape) + sums, image.shape)
 
 
 def _on_cells(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array]:
-    """Colours (H, W, C) of cells, and motions (H, W, 3) of their samples; 0 in empty ones."""
+    """Colours (H, W, C) of cells, and motions (H, W, 2) of their samples; 0 in empty ones."""
     xp, (height, width) = namespace(rgba), row.shape
-    at = np.mgrid[:height, :width][::-1] + 0.5
-    centres = engine_of(positions).constant(np.stack([*at, 0 * at[0]], axis=-1), positions)
-    covered = (row >= 0)[..., None]
+    covered, at = (row >= 0)[..., None], centres(height, width, positions)
     color = xp.where(covered, unpack(rgba, row), 0.0)
-    return color, xp.where(covered, unpack(positions, row) - centres, 0.0)
+    return color, xp.where(covered, unpack(positions, row)[..., :2] - at, 0.0)
 
 
 def _inside(color: Array, motion: Array, joined: Array) -> Array:

@@ -24,7 +24,7 @@ from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
 from rts.operations.operation import Arrays, Operation, Some
-from rts.splatting.cells import over, unpack
+from rts.splatting.cells import centres, over, unpack
 
 
 class Stack(NamedTuple):
@@ -90,11 +90,11 @@ class Operands(NamedTuple):
         whole, motion = cells[..., : rgba.shape[1]], cells[..., rgba.shape[1] :]
         numbers = [_numbered(sides.front[i * breaks : (i + 1) * breaks], (height * width) + i * breaks) for i in (0, 1)]
         rows = xp.stack(numbers, axis=-1)
-        centres = xp.reshape(_centres(row, rgba), (-1, 2))
+        at = xp.reshape(centres(height, width, rgba), (-1, 2))
         if engine_of(rgba).differentiates:
             motion = motion + sides.motion(splats)
         return cls(
-            xp.concat([xp.concat([centres, xp.zeros_like(centres[:, :1])], axis=-1), sides.ending]),
+            xp.concat([xp.concat([at, xp.zeros_like(at[:, :1])], axis=-1), sides.ending]),
             xp.concat([xp.reshape(whole, (-1, rgba.shape[1])), sides.stack.whole]),
             xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), 0), (height, width)),
             replace(outlines, rows=rows, inner=rows),
@@ -107,7 +107,8 @@ def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> 
 
     Slopes are means of the differences from and to the next cells of the same layers.
     """
-    xp, there, cells = namespace(rgba), row >= 0, Stack.of(positions, rgba, row, _centres(row, rgba)[None, ...])
+    xp, there, (height, width) = namespace(rgba), row >= 0, row.shape[1:]
+    cells = Stack.of(positions, rgba, row, centres(height, width, rgba)[None, ...])
     color, total, (through, behind) = stopped(cells.color), 0.0, cells.weights()
     for axis in (0, 1):
         here = (joined[axis, ...][None, ...] & there & xp.roll(there, -1, axis=2 - axis))[..., None]
@@ -147,13 +148,6 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _forward, _push, _pull, differentiable=2)
 """(H, W, 2 C) of positions (N, 3), colours (N, C), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
-
-
-def _centres(row: Array, like: Array) -> Array:
-    """Centres (H, W, 2) of the cells of `row` (K, H, W), of the engine of `like`."""
-    height, width = row.shape[1:]
-    across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return engine_of(like).constant(np.stack([across, down], axis=-1), like)
 
 
 def _numbered(row: Array, first: int) -> Array:

@@ -1,0 +1,59 @@
+"""What a step of a fit moves between the host and another device: each array by name, and faces once."""
+
+from collections import Counter
+
+import elsewhere
+import numpy as np
+import pytest
+from helpers import icosphere
+
+import rts
+
+torch = pytest.importorskip("torch")
+crossings = pytest.importorskip("benchmarks.gpu.crossings")
+pytestmark = pytest.mark.devices
+
+Task = pytest.importorskip("benchmarks.speed.pose_iteration").Task
+VERTICES, FACES = icosphere(2)
+SIDE = 24
+
+
+@pytest.fixture(scope="module")
+def step():
+    """The crossings of a step, in their order."""
+    task = Task("ball", np.float32(0.5 * VERTICES), FACES, SIDE, "lambert", 1)
+    with elsewhere.Device():
+        return crossings.counted(task, elsewhere.DEVICE.type)[0]
+
+
+def bytes_by_name(found):
+    sums = Counter()
+    for crossing, name in zip(found, crossings.names(found), strict=True):
+        sums[crossing.way, name] += crossing.bytes
+    return sums
+
+
+@pytest.mark.thorough
+def test_samples_and_breaks_cross_by_their_sizes(step):
+    sums, cells = bytes_by_name(step), (SIDE + 4) ** 2
+    assert sums["to the device", "row"] == sums["to the host", "row"] == 4 * cells
+    assert sums["to the device", "joined"] == 2 * cells
+    rows, breaks = sums["to the device", "ids"] // 12, sums["to the device", "near"] // 4
+    assert 0 < rows < cells and 0 < breaks
+    assert sums["to the device", "barycentrics"] == 8 * rows
+    assert sums["to the device", "rows of breaks"] == 24 * breaks and sums["to the device", "slopes"] == 16 * breaks
+    assert sums["to the host", "vertices"] == 12 * len(VERTICES)
+
+
+@pytest.mark.thorough
+def test_every_crossing_has_a_name_and_faces_cross_once(step):
+    known = {name for names in crossings.ORDER.values() for name in names} | {crossings.NUMBERS}
+    assert set(crossings.names(step)) <= known
+    assert not bytes_by_name(step)["to the device", "faces"]
+    with elsewhere.Device():
+        like, table = torch.zeros(1).to(elsewhere.DEVICE), rts.Mesh(FACES).faces
+        engine = rts.engine_of(like)
+        with crossings.Counted(elsewhere.DEVICE.type) as counts:
+            first, second = (engine.constant(table, like) for _ in range(2))
+            changing = [engine.constant(np.array(table), like) for _ in range(2)]
+    assert first is second and changing[0] is not changing[1] and len(counts.crossings) == 3
