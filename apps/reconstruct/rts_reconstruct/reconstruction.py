@@ -10,8 +10,8 @@ import numpy as np
 
 import rts
 from rts.diagnostics.measuring_api import output_folder, writing
-from rts_reconstruct import files, job, outlining, pictures, stages
-from rts_reconstruct.arguments import check_counts, checked_masks, checked_region
+from rts_reconstruct import files, job, outlining, picture_files, pictures, stages
+from rts_reconstruct.arguments import check_counts, check_other_folder, checked_masks, checked_region
 from rts_reconstruct.cameras import with_cameras
 from rts_reconstruct.contradictions import contradictions
 from rts_reconstruct.model import Model
@@ -98,7 +98,7 @@ def reconstruct(
 
     Raises:
         InputError: an argument of the wrong kind; pictures that cannot be read, are too few, or tell no object; a start
-            that no view sees; or a folder that cannot be written.
+            that no view sees; or a folder to write into that cannot be written, or has the pictures.
     """
     defaults: dict[str, Any] = QUICK if quick else {"steps": STEPS, "size": SIZE, "texture": TEXTURE, "faces": 1}
     steps = int(defaults["steps"]) if steps is None else steps
@@ -113,6 +113,7 @@ def reconstruct(
     if 0 < texture < 16:
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)
+    check_other_folder(folder, views)
     first = job.join()
     views = job.shared(lambda: with_cameras(views, folder / "photographs"))
     masks, region = checked_masks(masks), checked_region(region)
@@ -155,7 +156,7 @@ def reconstruct(
 
 def _notes(shots: pictures.Pictures, folder: Path) -> list[str]:
     """Lines on what the points and masks tell, before the fit."""
-    notes = contradictions(shots)
+    notes = [*picture_files.turned(shots.given), *picture_files.repeated(shots.given), *contradictions(shots)]
     if shots.by_points and shots.region is not None:
         ball = ",".join(f"{x:.4g}" for x in (*shots.region.center, shots.region.unit))
         notes.append(

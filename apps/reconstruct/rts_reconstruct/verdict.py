@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+import rts
 from rts_reconstruct import points, posing
 from rts_reconstruct.measures import Measured, mean_of, measured_view
 from rts_reconstruct.model import Model
@@ -141,5 +143,7 @@ def _disagreeing(model: Model, pictures: Pictures, rows: Sequence[Measured], set
 def _gain(model: Model, pictures: Pictures, place: int, settings: Settings) -> float:
     """The PSNR, dB, that a view gains if its camera is fitted to the mesh."""
     plain = model._replace(atlas=None)  # Which is faster, and tells as much.
-    moved = posing.posed(plain, pictures, settings._replace(progress=False), [place], steps=posing.FEW)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rts.errors.InputWarning)  # The fit of all views has warned, by their numbers.
+        moved = posing.posed(plain, pictures, settings._replace(progress=False), [place], steps=posing.FEW)
     return measured_view(moved, pictures, place).psnr - measured_view(plain, pictures, place).psnr

@@ -117,20 +117,26 @@ def masked(inverted):
 
 
 def test_inverted_masks_are_refused_with_a_name_and_the_polarity():
-    with pytest.raises(rts.InputError, match=r"white along the border and black within: 0.png.*expected white where"):
+    with pytest.raises(
+        rts.InputError, match=r"white along the border and black within in 8 of 8 views \(0.png.*expected white where"
+    ):
         pictures.read(masked(range(8)), SIZE, 0)
 
 
 def test_a_mask_that_contradicts_the_others_is_named():
     assert contradictions.contradictions(pictures.read(masked(()), SIZE, 0)) == []
-    (line,) = contradictions.contradictions(pictures.read(masked([5]), SIZE, 0))
+    with pytest.warns(rts.errors.RtsWarning, match="look whether these are inverted"):
+        one = pictures.read(masked([5]), SIZE, 0)
+    (line,) = contradictions.contradictions(one)
     assert "masks contradict each other:" in line  # Of so few views none is outvoted.
     more = []
     for i, camera in enumerate(cameras(20)):
         alpha = np.asarray(rts.render(ellipsoid(), camera, (SIZE, SIZE)))[..., 3]
         image = np.full((SIZE, SIZE, 3), 0.5, np.float32)
         more.append(rts.View(camera, image, name=f"{i}.png", mask=1 - alpha if i == 5 else alpha))
-    (line,) = contradictions.contradictions(pictures.read(more, SIZE, 0))
+    with pytest.warns(rts.errors.RtsWarning, match="5.png"):
+        several = pictures.read(more, SIZE, 0)
+    (line,) = contradictions.contradictions(several)
     assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1
 
 
