@@ -305,7 +305,8 @@ def test_masks_are_made_smaller_like_pictures(tmp_path):
 
 def test_masks_may_be_called_as_a_picture_but_for_its_ending_and_others_are_told(tmp_path):
     text_model(tmp_path, {1: ("PINHOLE", SIZE, MODELS["PINHOLE"][1])}, [(1, ROTATION, TRANSLATION, 1, "a.jpg", [])])
-    save(tmp_path / "images/a.jpg", np.zeros(SIZE))
+    save(tmp_path / "images/a.png", np.zeros(SIZE))
+    (tmp_path / "images/a.png").rename(tmp_path / "images/a.jpg")
     save(tmp_path / "masks/mask_a.png", half_white())
     with pytest.warns(
         rts.errors.FileWarning, match=r"none of 1 files of .*masks \(mask_a.png …\) .* such as a.jpg.png"
