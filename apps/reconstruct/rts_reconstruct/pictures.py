@@ -41,6 +41,7 @@ class Pictures:
         solid: what the points fill there, as a mesh, where a start or outlines need it; the world of the pictures is
             that of `region` then.
         by_points: True if the outlines are those of `solid`.
+        exposures: (B,) of `exposures.exposures`, that were taken out of the pictures; None for none.
     """
 
     views: list[rts.View]
@@ -54,6 +55,7 @@ class Pictures:
     region: World | None = None
     solid: trimesh.Trimesh | None = None
     by_points: bool = False
+    exposures: np.ndarray | None = None
 
 
 def read(

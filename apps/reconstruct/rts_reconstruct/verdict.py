@@ -82,6 +82,8 @@ def verdict(
     if away is not None:
         figures += f", points off by {away[0]:.2f} % of the diagonal, 90th percentile {away[1]:.2f} %"
     figures += f", {100 * unseen:.0f} % of the surface unseen"
+    if pictures.exposures is not None:
+        figures += f", exposures that differ by {100 * pictures.exposures.std():.0f} % evened out"
     blob = psnr < PSNR or (overlap is not None and overlap < OVERLAP) or (away is not None and away[1] > AWAY)
     findings = []
     if overlap is not None and overlap < LOOSE:

@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from rts_reconstruct import contradictions, detail, files, outlining, pictures, points, posing, sight, solid, texturing
+from rts_reconstruct import (
+    contradictions,
+    detail,
+    exposures,
+    files,
+    outlining,
+    pictures,
+    points,
+    posing,
+    sight,
+    solid,
+    texturing,
+)
 from rts_reconstruct.measures import measured
 from rts_reconstruct.model import Model, moved_camera
 from rts_reconstruct.points import Points
@@ -231,3 +243,36 @@ def test_what_a_run_that_was_killed_had_not_finished_is_removed(tmp_path):
     (tmp_path / "mesh.obj").write_text("")
     files.forget_unfinished(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.obj"]
+
+
+# ------------------------------------------------------------------------------------------------------- exposures
+
+
+def test_exposures_that_differ_are_evened_out():
+    logs = np.random.default_rng(0).uniform(-0.15, 0.15, len(images()))
+    logs -= logs[[0, 1, 2, 4, 5, 6]].mean()  # The others are held out.
+    factors = iter(np.exp(logs))
+    taken = pictures.read(
+        views(lambda image: image * np.append(np.full(3, next(factors)), 1).astype(np.float32)), SIZE, 4
+    )
+    model = about(taken, truth())
+    found = exposures.exposures(model, taken)
+    np.testing.assert_allclose(found, logs[taken.numbers], atol=0.01)
+    even = exposures.evened(taken, found)
+    for place, view in enumerate(even.views + even.held_out):
+        image = images()[taken.numbers[place]]
+        np.testing.assert_allclose(view.image, image, atol=0.01)
+        np.testing.assert_allclose(even.given[place].image, image, atol=0.01)
+    assert exposures.exposures(model, even) is None and exposures.evened(even, None) is even
+    settings = Settings(4, 0, False, "mesh", False)
+    told = verdict(model, even, measured(model, even), [[1.0] * 20 + [0.1] * 20], 0.0, settings)
+    assert "exposures that differ by" in told.figures
+
+
+def test_a_shadow_on_less_than_half_of_a_picture_is_no_exposure():
+    shaded = [np.array(image) for image in images()]
+    for image in shaded[::2]:
+        image[: 2 * SIZE // 5, :, :3] *= 0.7
+    several = [rts.View(camera, image) for camera, image in zip(cameras(), shaded, strict=True)]
+    found = pictures.read(several, SIZE, 0)
+    assert exposures.exposures(about(found, truth()), found) is None
