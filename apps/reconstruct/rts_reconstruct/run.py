@@ -112,7 +112,8 @@ class Run:
         """A stage of shape and colours, unless an earlier run made it."""
         if number < len(self.losses) or self.stopped:
             return
-        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
+        settings = self.settings._replace(robust=self.settings.robust and number > 0)  # At first all is far off.
+        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, settings, *self._reporting(number))
         fit = fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces)))
         if self.settings.cameras:
             fit = posing.refined(fit, self.pictures, self.settings)

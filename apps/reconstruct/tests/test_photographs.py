@@ -152,6 +152,20 @@ def test_a_mask_that_contradicts_the_others_is_named():
     assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1
 
 
+def test_masks_that_are_inexact_are_told_by_their_hull():
+    def consistency(change):
+        several = []
+        for i, view in enumerate(views()):
+            image = np.array(view.image)
+            image[..., 3] = change(image[..., 3], i)
+            several.append(rts.View(view.camera, image))
+        return contradictions.consistency(pictures.read(several, SIZE, 0))
+
+    assert consistency(lambda alpha, i: alpha) > 0.9
+    assert consistency(lambda alpha, i: np.roll(alpha, 4 * (-1) ** i, axis=i // 2 % 2)) < contradictions.INEXACT
+    assert contradictions.consistency(pictures.read(views(on_white), SIZE, 0)) == 1  # Without masks.
+
+
 def test_masks_of_colmap_only_say_which_pixels_count():
     found = pictures.read(masked(()), SIZE, 0, np.ones(3), masks="ignore")
     assert not found.outlined
