@@ -303,6 +303,21 @@ def test_masks_are_made_smaller_like_pictures(tmp_path):
     np.testing.assert_allclose(view.mask, mask[:24, :32] / 255, atol=1e-6)
 
 
+def test_masks_may_be_called_as_a_picture_but_for_its_ending_and_others_are_told(tmp_path):
+    text_model(tmp_path, {1: ("PINHOLE", SIZE, MODELS["PINHOLE"][1])}, [(1, ROTATION, TRANSLATION, 1, "a.jpg", [])])
+    save(tmp_path / "images/a.png", np.zeros(SIZE))
+    (tmp_path / "images/a.png").rename(tmp_path / "images/a.jpg")
+    save(tmp_path / "masks/mask_a.png", half_white())
+    with pytest.warns(
+        rts.errors.FileWarning, match=r"none of 1 files of .*masks \(mask_a.png …\) .* such as a.jpg.png"
+    ):
+        (view,) = rts.load_views(tmp_path, split="all")
+    assert view.mask is None
+    save(tmp_path / "masks/a.png", half_white())
+    (view,) = rts.load_views(tmp_path, split="all")
+    np.testing.assert_allclose(view.mask, half_white() / 255, atol=1e-6)
+
+
 def test_wrong_masks_are_refused_in_one_line(tmp_path):
     save(tmp_path / "m.png", half_white(width=WIDTH + 1))
     with pytest.raises(InputError, match="mask .*m.png has 129 × 96 pixels, and .*a.png 128 × 96"):

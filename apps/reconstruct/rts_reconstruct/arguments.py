@@ -35,3 +35,15 @@ def check_counts(**counts: tuple[Any, int]) -> None:
     for name, (value, least) in counts.items():
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise rts.InputError(f"{name} is {value!r:.60}; expected a whole number, at least {least}")
+
+
+def check_other_folder(folder: Path, views: Any) -> None:
+    """Refuse to write into the folder of the data set, or of its pictures, which results would be mixed with."""
+    if not isinstance(views, (str, Path)):
+        return
+    data = Path(views) if Path(views).is_dir() else Path(views).parent
+    if folder.resolve() in {place.resolve() for place in (data, data / "images", data / "masks", data / "sparse")}:
+        raise rts.InputError(
+            f"the folder to write into, {folder}, is that of the pictures; expected another one, such as "
+            f"{data / 'reconstruction'}"
+        )

@@ -15,13 +15,10 @@ from typing import Any
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 import rts
+from rts_reconstruct.folders import has_photographs_alone, left_out, photographs_in
 
-PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-"""Endings of the files that are taken for photographs."""
 EXHAUSTIVE = 80
 """The most photographs of which all pairs are compared; of more, each is compared with the next ones by name."""
-TABLES = (".json", ".npy", ".bin", ".txt")
-"""Endings of files that have cameras. A folder of pictures that has one of these is no folder of photographs alone."""
 FEWEST = 3
 """Photographs, and registered ones, that a reconstruction needs at least."""
 ORIENTATION = 274
@@ -85,17 +82,12 @@ def find_cameras(photos: Any, out: Any, *, size: int = 1600) -> FoundCameras:
         raise rts.InputError(f"{out} is a file; expected a folder")
     if isinstance(size, bool) or not isinstance(size, int) or size < 64:
         raise rts.InputError(f"size is {size!r:.40}; expected a number of pixels, at least 64")
-    files = photographs_in(photos)
-    if len(files) < FEWEST:
-        raise rts.InputError(
-            f"{photos} has {len(files)} photograph{'s'[: len(files) != 1]}; expected at least {FEWEST}, "
-            f"and thirty around a thing for all of its surface"
-        )
+    files = _checked(photos)
     pycolmap = _pycolmap()
     if (out / "sparse").exists() or (out / "images").exists():
         raise rts.InputError(f"{out} has a data set already; choose another folder, or delete it")
     with _whole(out) as folder:
-        turned, groups = _upright(files, photos, folder / "images")
+        turned, groups = _upright(files, folder / "images")
         with _quiet(pycolmap):
             model = _model(pycolmap, folder, groups, size)
             if model is None:
@@ -113,33 +105,49 @@ def find_cameras(photos: Any, out: Any, *, size: int = 1600) -> FoundCameras:
         )
 
 
-def photographs_in(folder: Path) -> list[Path]:
-    """The photographs in a folder, by name.
-
-    Raises:
-        InputError: there is no such folder.
-    """
-    if not folder.is_dir():
-        raise rts.InputError(f"{folder} is no folder; expected one with photographs")
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES and file.is_file())
-
-
 def with_cameras(views: Any, out: Path) -> Any:
     """The data set of photographs that come alone, made in `out` unless it is there; any other views as they are.
 
     Raises:
-        InputError, PluginError: as `find_cameras`.
+        InputError: a path that has neither photographs nor cameras; or as `find_cameras`.
+        PluginError: as `find_cameras`.
     """
-    if not isinstance(views, (str, os.PathLike)) or not Path(views).is_dir() or not photographs_in(Path(views)):
+    if not has_photographs_alone(views):
         return views
     folder = Path(views)
-    if (folder / "sparse").exists() or any(file.suffix in TABLES for file in folder.iterdir()):
-        return views
     if not (out / "sparse").exists():
+        _checked(folder)
         _pycolmap()  # Where it is missing, that is all there is to say.
         print(f"{folder} has photographs without cameras: looking for them, which takes minutes", file=sys.stderr)
+        if other := left_out(folder):
+            print(f"{folder} has {other}, too, which are not read: export them as JPEG", file=sys.stderr)
         print(f"{find_cameras(folder, out)}; {out} is a data set of COLMAP", file=sys.stderr)
     return out
+
+
+def _checked(photos: Path) -> list[Path]:
+    """The photographs of a folder; too few, and files that are no pictures, are refused."""
+    files = photographs_in(photos)
+    if len(files) < FEWEST:
+        raise rts.InputError(
+            f"{photos} has {len(files)} photograph{'s'[: len(files) != 1]}; expected at least {FEWEST}, "
+            f"and thirty around a thing for all of its surface"
+        )
+    for file in files:
+        with _read(file):
+            pass
+    return files
+
+
+@contextlib.contextmanager
+def _read(file: Path) -> Iterator[Image.Image]:
+    """A photograph; an InputError where it cannot be read."""
+    try:
+        with Image.open(file) as picture:
+            yield picture
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        said = str(error).split(repr(str(file)))[0].strip()
+        raise rts.InputError(f"{file} cannot be read as a picture ({said}); take it out of {file.parent}") from None
 
 
 def _pycolmap() -> Any:
@@ -154,34 +162,38 @@ def _pycolmap() -> Any:
 
 @contextlib.contextmanager
 def _whole(out: Path) -> Iterator[Path]:
-    """A folder beside `out` whose files become those of `out` where nothing fails, and vanish where something does."""
+    """A folder in `out` whose files become those of `out` where nothing fails, and vanish where something does."""
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".new-", dir=out) as name:
-        yield Path(name)
-        for made in ("images", "sparse"):
-            os.replace(Path(name) / made, out / made)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".new-", dir=out) as name:
+            yield Path(name)
+            for made in ("images", "sparse"):
+                os.replace(Path(name) / made, out / made)
+    except BaseException:
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
-def _upright(files: list[Path], photos: Path, to: Path) -> tuple[tuple[str, ...], dict[Any, list[str]]]:
+def _upright(files: list[Path], to: Path) -> tuple[tuple[str, ...], dict[Any, list[str]]]:
     """Copy photographs, upright; names of those turned, and names by size and focal length."""
     to.mkdir()
     turned: list[str] = []
     groups: dict[Any, list[str]] = {}
     for file in files:
-        try:
-            with Image.open(file) as picture:
-                exif = picture.getexif()
-                lens = exif.get_ifd(0x8769)
-                upright = ImageOps.exif_transpose(picture) if exif.get(ORIENTATION) in range(2, 9) else None
-                if upright is None:
-                    picture.load()
-                    shutil.copy2(file, to / file.name)
-                else:
-                    upright.save(to / file.name, exif=upright.getexif(), quality=95)
-                    turned.append(file.name)
-                found = (upright or picture).size
-        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-            raise rts.InputError(f"{file} cannot be read as a picture ({error}); take it out of {photos}") from None
+        with _read(file) as picture:
+            exif = picture.getexif()
+            lens = exif.get_ifd(0x8769)
+            upright = ImageOps.exif_transpose(picture) if exif.get(ORIENTATION) in range(2, 9) else None
+            if upright is None:
+                picture.load()
+                shutil.copy2(file, to / file.name)
+            else:
+                upright.save(to / file.name, exif=upright.getexif(), quality=95)
+                turned.append(file.name)
+            found = (upright or picture).size
         groups.setdefault((found, str(lens.get(37386)), exif.get(272)), []).append(file.name)
     return tuple(turned), groups
 

@@ -10,7 +10,7 @@ import rts
 from rts_reconstruct.masks import where
 from rts_reconstruct.pictures import Pictures
 from rts_reconstruct.points import visible
-from rts_reconstruct.starts import REACH, lattice_points
+from rts_reconstruct.starts import REACH, hull, lattice_points
 
 COUNT = 48
 """Points of the lattice along each axis."""
@@ -20,6 +20,8 @@ APART = 0.2
 """How far a view's overlap is below the median of all if its mask is named."""
 CONSISTENT = 0.7
 """The least overlap of masks of one object with their common hull."""
+INEXACT = 0.85
+"""The consistency of masks below which they are inexact: most of their outlines are not the object's."""
 FEWEST, ENOUGH = 4, 12
 """Of fewer views nothing is said, or none is named: each one carves too much that no other does."""
 MOST = 5
@@ -52,6 +54,27 @@ def contradictions(pictures: Pictures) -> list[str]:
         f"the masks contradict each other{of_all}: what they have in common is not what they show; mend them, "
         "leave them out if COLMAP has points (--masks ignore), or look whether the cameras are right"
     ]
+
+
+def consistency(pictures: Pictures) -> float:
+    """The median overlap of masks with pictures of their visual hull; 1 where masks are made, 0 where it is empty.
+
+    Right masks differ from it by a cell of its lattice and by what few views do not carve away.
+    """
+    if not pictures.outlined or pictures.by_points or len(pictures.views) < FEWEST:
+        return 1.0
+    try:
+        mesh = hull(pictures)
+    except rts.InputError:
+        return 0.0
+    theta = {"vertices": np.asarray(mesh.vertices, np.float32), "colors": np.ones((len(mesh.vertices), 3), np.float32)}
+    part = rts.Part(rts.Mesh(np.asarray(mesh.faces, np.int32)), theta, "unlit")
+    found = []
+    for view in pictures.views:
+        shown = np.asarray(rts.render(part, view.camera, view.size, splatter="none"))[..., 3] > 0.5
+        mask, counts = view.image[..., 3] > 0.5, np.ones(view.size) if view.mask is None else view.mask
+        found.append((counts * (shown & mask)).sum() / max((counts * (shown | mask)).sum(), 1))
+    return float(np.median(found))
 
 
 def _overlaps(views: Sequence[rts.View], spared: float) -> np.ndarray:

@@ -106,27 +106,45 @@ def _cut_out(view: rts.View) -> np.ndarray:
 
 
 def _check_shown(views: Sequence[rts.View], named: str) -> None:
-    """Refuse pictures half of which show no object, by their alpha or masks; warn of fewer."""
+    """Refuse pictures half of which show no object, by their alpha or masks; warn of fewer, and of those all white."""
     blank = [i for i, view in enumerate(views) if not (view.image[..., 3] >= 0.5).any()]
-    if not blank:
-        return
-    names = ", ".join(str(where(views[i]) or i) for i in blank[:3]) + (", …" if len(blank) > 3 else "")
-    told = f"alpha or masks are black all over in {len(blank)} of {len(views)} views of {named}: {names}"
-    if 2 * len(blank) >= len(views):
-        raise rts.InputError(f"{told}; expected masks, or alpha, that are white where the object is")
-    warnings.warn(f"{told}; what these see is taken for empty: leave them out if it is not", rts.errors.RtsWarning, 3)
+    if blank:
+        told = f"alpha or masks are black all over in {_counted(views, blank)} of {named}"
+        if 2 * len(blank) >= len(views):
+            lightest = max(float(views[i].image[..., 3].max()) for i in blank)
+            few = f" (the lightest pixel is {lightest:.3f} of white)" if lightest > 0 else ""
+            raise rts.InputError(f"{told}{few}; expected masks, or alpha, that are white where the object is")
+        _warn(f"{told}; what these see is taken for empty: leave them out if it is not")
+    full = [i for i, view in enumerate(views) if not ((view.image[..., 3] < 0.5) & (_mask(view) > 0.5)).any()]
+    if full:
+        _warn(
+            f"alpha or masks are missing, or white all over, in {_counted(views, full)} of {named}; all that these see "
+            "is taken for the object: add masks, or leave them out, if it is not"
+        )
 
 
 def _check_polarity(views: Sequence[rts.View], named: str) -> None:
-    """Refuse pictures most of which have an alpha of 1 along the border, and of 0 within."""
+    """Refuse pictures most of which have an alpha of 1 along the border, and of 0 within; warn of fewer."""
     inverted = [i for i, view in enumerate(views) if _is_inverted(view.image[..., 3])]
+    if not inverted:
+        return
+    told = f"alpha or masks are white along the border and black within in {_counted(views, inverted)} of {named}"
     if 2 * len(inverted) > len(views):
-        names = ", ".join(str(where(views[i]) or i) for i in inverted[:3]) + (", …" if len(inverted) > 3 else "")
         raise rts.InputError(
-            f"alpha or masks of {len(inverted)} of {len(views)} views of {named} are white along the border and black "
-            f"within: {names}; expected white where the object is, so invert them (or --masks ignore, if black means "
-            "that pixels do not count)"
+            f"{told}; expected white where the object is, so invert them (or --masks ignore, if black means that "
+            "pixels do not count)"
         )
+    _warn(f"{told}; expected white where the object is: look whether these are inverted")
+
+
+def _counted(views: Sequence[rts.View], places: Sequence[int]) -> str:
+    """How many views these are, and the names of some."""
+    names = ", ".join(str(where(views[i]) or i) for i in places[:3]) + (", …" if len(places) > 3 else "")
+    return f"{len(places)} of {len(views)} views ({names})"
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, rts.errors.RtsWarning, 5)
 
 
 def _is_inverted(alpha: np.ndarray) -> bool:
@@ -139,6 +157,9 @@ def _border(images: Sequence[np.ndarray], named: str, white: bool) -> np.ndarray
     sides = [side[..., :3].reshape(-1, 3) for i in images for side in (i[0], i[-1], i[:, 0], i[:, -1])]
     pixels = np.concatenate(sides)
     behind = np.median(pixels, axis=0)
+    if all(np.abs(image[..., :3] - behind).max() <= PLAIN for image in images):
+        colour = ", ".join(f"{x:.2f}" for x in behind)
+        raise rts.InputError(f"the pictures of {named} have no other colour than {colour}; expected ones of an object")
     scatter = float(np.median(np.abs(pixels - behind).max(axis=1)))
     if scatter > PLAIN:
         fault = f"the pictures of {named} have neither alpha nor masks"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,9 @@ from rts_reconstruct import points as seen_points
 from rts_reconstruct.points import Points
 from rts_reconstruct.solid import solid_of
 from rts_reconstruct.world import World, around
+
+SMALLEST = 8
+"""Pixels of the shorter sides of pictures, at least."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class Pictures:
         solid: what the points fill there, as a mesh, where a start or outlines need it; the world of the pictures is
             that of `region` then.
         by_points: True if the outlines are those of `solid`.
+        exposures: (B,) of `exposures.exposures`, that were taken out of the pictures; None for none.
     """
 
     views: list[rts.View]
@@ -51,6 +55,7 @@ class Pictures:
     region: World | None = None
     solid: trimesh.Trimesh | None = None
     by_points: bool = False
+    exposures: np.ndarray | None = None
 
 
 def read(
@@ -89,17 +94,27 @@ def read(
     if len(kept) < 2:
         one = f"{len(kept)} of them is" if len(kept) == 1 else f"{len(kept)} of them are"
         raise rts.InputError(
-            f"{len(views)} view{'s'[: len(views) != 1]} in {_named(path)}, and {one} left to fit; expected at least two"
+            f"{len(views)} view{'s'[: len(views) != 1]} in {_named(path)}, and {one} left to fit; expected at least "
+            "two, and thirty around a thing for all of its surface"
         )
     given, named = views, _named(path)
     points = seen_points.read(path)
     ball = None if points is None else _region(points, given, region)
     views = [_smaller(view, size) for view in views]
     alphas = masks_of.told(views, named, ignored=masks == "ignore")
+    if points is None and alphas is None and background is None:
+        seen_points.check_readable(path)
+    if points is None and region is not None:
+        warnings.warn(f"region is not used: {named} has no points of COLMAP", rts.errors.RtsWarning, 3)
     by_points = ball is not None and alphas is None and background is None
     solid = None
     if points is not None and ball is not None and (by_points or folder is not None or start == "points"):
         solid = solid_of(points.inside(ball))
+        if solid is None and region is not None:
+            raise rts.InputError(
+                f"region is {list(region)}, where COLMAP's points fill nothing; expected x, y, z and radius of a ball "
+                "about the object: leave it out for that of the densest points"
+            )
     world = around([view.camera.for_size(view.size) for view in given]) if solid is None or ball is None else ball
     behind = np.ones(3, np.float32) if background is None else masks_of.checked_background(background)
     if alphas is not None:
@@ -132,13 +147,19 @@ def _named(path: Any) -> str:
 
 def _loaded(path: Any) -> list[rts.View]:
     """All views of a data set; of one that tells apart training and test, those for training."""
-    with contextlib.suppress(rts.InputError):
-        return rts.load_views(path, split="all", linear=False)  # COLMAP's: "train" would leave an eighth out.
-    return rts.load_views(path, linear=False)
+    apart = False
+    if isinstance(path, (str, Path)):
+        apart = (Path(path) / "transforms_train.json").is_file() and not (Path(path) / "transforms.json").is_file()
+    # COLMAP's "train" would leave an eighth out.
+    return rts.load_views(path, split="train" if apart else "all", linear=False)
 
 
 def _smaller(view: rts.View, size: int) -> rts.View:
     """A view whose longer side has at most `size` pixels, read once. Rows and columns that are left over are cut."""
+    if min(view.size) < SMALLEST:
+        raise rts.InputError(
+            f"{view.name or 'a view'} has {view.size[1]} × {view.size[0]} pixels; expected {SMALLEST} a side or more"
+        )
     n = -(-max(view.size) // size)
     height, width = (extent // n for extent in view.size)
     if min(height, width) < 1:

@@ -40,11 +40,7 @@ class Points(NamedTuple):
 
 def read(path: Any) -> Points | None:
     """The points of a data set of COLMAP; None for other data sets, and where pycolmap is missing."""
-    if not isinstance(path, (str, Path)):
-        return None
-    folder = Path(path) if Path(path).is_dir() else Path(path).parent
-    places = (folder / "sparse" / "0", folder / "sparse", folder)
-    model = next((p for p in places if (p / "points3D.bin").is_file() or (p / "points3D.txt").is_file()), None)
+    model = _model_of(path)
     if model is None:
         return None
     try:
@@ -66,6 +62,32 @@ def read(path: Any) -> Points | None:
         return None
     positions = np.array([point.xyz for point in scene.points3D.values()])
     return Points(positions, np.array([row for row, _ in seen]), np.array([eye for _, eye in seen]))
+
+
+def check_readable(path: Any) -> None:
+    """Refuse a data set whose points are needed, and that COLMAP's Python package, which is missing, would read.
+
+    Raises:
+        PluginError: pycolmap is missing (extra `photos`).
+    """
+    if _model_of(path) is None:
+        return
+    try:
+        import pycolmap  # noqa: F401
+    except ImportError:
+        raise rts.errors.PluginError(
+            f"{path} has points that tell the object, as neither alpha nor masks do; pycolmap reads them: pip install "
+            "-c constraints.txt './apps/reconstruct[photos]' (or give --background)"
+        ) from None
+
+
+def _model_of(path: Any) -> Path | None:
+    """The folder with the points of a data set of COLMAP; None if there is none."""
+    if not isinstance(path, (str, Path)):
+        return None
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    places = (folder / "sparse" / "0", folder / "sparse", folder)
+    return next((p for p in places if (p / "points3D.bin").is_file() or (p / "points3D.txt").is_file()), None)
 
 
 def region(points: Points, views: Sequence[rts.View]) -> World | None:

@@ -11,6 +11,7 @@ import numpy as np
 import rts
 from rts.diagnostics.measuring_api import writing
 from rts_reconstruct import detail, files, job, measures, pictures, posing, sight, stages, texturing
+from rts_reconstruct.exposures import evened, exposures
 from rts_reconstruct.light import decoded
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
@@ -89,6 +90,7 @@ class Run:
         first: bool,
     ):
         self.pictures, self.settings, self.saved, self.watch = shots, settings, saved, watch
+        self._taken = shots  # As they are, in whatever exposure.
         self.model, self.folder, self.first = model, folder, first
         self.losses: list[list[float]] = []
         self.files: list[Path] = []
@@ -99,6 +101,7 @@ class Run:
         """Read what an earlier run has kept, or forget it."""
         if resume and (kept := job.shared(self.saved.read)) is not None:
             self.model, self.losses, self.seconds = kept
+            self._even()
         elif not resume and self.first:
             self.saved.forget()
         self._started = time.perf_counter() - self.seconds
@@ -109,11 +112,17 @@ class Run:
         """A stage of shape and colours, unless an earlier run made it."""
         if number < len(self.losses) or self.stopped:
             return
-        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
+        settings = self.settings._replace(robust=self.settings.robust and number > 0)  # At first all is far off.
+        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, settings, *self._reporting(number))
         fit = fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces)))
         if self.settings.cameras:
             fit = posing.refined(fit, self.pictures, self.settings)
         self._keep(fit, losses)
+        self._even()
+
+    def _even(self) -> None:
+        """Take the exposures of pictures, as the model tells them, out of what is fitted next."""
+        self.pictures = evened(self._taken, job.shared(lambda: exposures(self.model, self._taken)))
 
     def texture(self, number: int, size: int, steps: int) -> None:
         """The stage of the texture, unless an earlier run made it; one that was stopped is baked alone."""

@@ -22,6 +22,8 @@ ROUNDS = 5
 """Rounds of remeshing."""
 
 
+ROBUST = rts.Loss("cauchy", f_scale=0.1)
+"""The loss of colours, 0 to 1, that most views agree on and some do not."""
 FOCAL = 0.1
 """The learning rate of focal lengths, as a share of that of poses: a step changes all pictures."""
 
@@ -64,6 +66,7 @@ class Settings(NamedTuple):
         cameras: True to fit cameras.
         surface: "mesh", "subdivision" or "isosurface".
         progress: True to show progress; None for only on a terminal.
+        robust: True if large differences are to count less, as of masks that are inexact.
     """
 
     batch: int
@@ -71,6 +74,7 @@ class Settings(NamedTuple):
     cameras: bool
     surface: str
     progress: bool | None
+    robust: bool = False
 
 
 def fitted(
@@ -100,6 +104,7 @@ def fitted(
         seed=settings.seed,
         cameras=moved_camera if settings.cameras else None,
         background=None if pictures.outlined else pictures.background,
+        loss=ROBUST if settings.robust else "linear",
     )
     fit = rts.fit(
         residuals,

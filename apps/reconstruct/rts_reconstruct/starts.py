@@ -42,7 +42,7 @@ def start(kind: str | Path | None, pictures: Pictures) -> trimesh.Trimesh:
     elif str(kind) == "ball":
         mesh = trimesh.creation.icosphere(4, radius=RADIUS)
     elif str(kind) == "hull":
-        mesh = _hull(pictures)
+        mesh = hull(pictures)
     else:
         mesh = _of_file(kind, pictures)
     _check_seen(mesh.vertices, pictures.views)
@@ -79,8 +79,12 @@ def nothing_in_common() -> rts.InputError:
     )
 
 
-def _hull(pictures: Pictures) -> trimesh.Trimesh:
-    """The largest piece of the space that no mask excludes (Laurentini 1994), by marching cubes."""
+def hull(pictures: Pictures) -> trimesh.Trimesh:
+    """The largest piece of the space that no mask excludes (Laurentini 1994), by marching cubes.
+
+    Raises:
+        InputError: pictures that do not tell the object, or whose masks have nothing in common.
+    """
     if not pictures.outlined:
         raise rts.InputError(
             "start is 'hull', which needs to know where the object is; the pictures have neither alpha nor masks: "

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+import rts
 from rts_reconstruct import points, posing
 from rts_reconstruct.measures import Measured, mean_of, measured_view
 from rts_reconstruct.model import Model
@@ -80,6 +82,8 @@ def verdict(
     if away is not None:
         figures += f", points off by {away[0]:.2f} % of the diagonal, 90th percentile {away[1]:.2f} %"
     figures += f", {100 * unseen:.0f} % of the surface unseen"
+    if pictures.exposures is not None:
+        figures += f", exposures that differ by {100 * pictures.exposures.std():.0f} % evened out"
     blob = psnr < PSNR or (overlap is not None and overlap < OVERLAP) or (away is not None and away[1] > AWAY)
     findings = []
     if overlap is not None and overlap < LOOSE:
@@ -141,5 +145,7 @@ def _disagreeing(model: Model, pictures: Pictures, rows: Sequence[Measured], set
 def _gain(model: Model, pictures: Pictures, place: int, settings: Settings) -> float:
     """The PSNR, dB, that a view gains if its camera is fitted to the mesh."""
     plain = model._replace(atlas=None)  # Which is faster, and tells as much.
-    moved = posing.posed(plain, pictures, settings._replace(progress=False), [place], steps=posing.FEW)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rts.errors.InputWarning)  # The fit of all views has warned, by their numbers.
+        moved = posing.posed(plain, pictures, settings._replace(progress=False), [place], steps=posing.FEW)
     return measured_view(moved, pictures, place).psnr - measured_view(plain, pictures, place).psnr

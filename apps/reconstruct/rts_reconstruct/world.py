@@ -44,12 +44,17 @@ def around(cameras: Sequence[rts.Camera]) -> World:
     Where axes are almost parallel, as of cameras on a rail, that point is before them, as far as they are apart.
 
     Raises:
-        InputError: no camera looks at the point.
+        InputError: all cameras stand in one place, or no camera looks at the point.
     """
     views = np.array([np.asarray(camera.view, np.float64) for camera in cameras])
     to_world = np.linalg.inv(views)
     eyes, axes = to_world[:, :3, 3], -to_world[:, :3, 2]
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    if np.ptp(eyes, axis=0).max() <= 1e-9 * max(np.abs(eyes).max(), 1e-9):
+        raise rts.InputError(
+            f"the cameras of all {len(eyes)} views stand in one place, {np.round(eyes[0], 3).tolist()}; expected "
+            "pictures from several sides"
+        )
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weak = 1e-6 * np.eye(3)  # Along axes that are parallel, the mean of the eyes counts.
     center = np.linalg.solve(

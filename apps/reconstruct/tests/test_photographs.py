@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from rts_reconstruct import contradictions, detail, files, outlining, pictures, points, posing, sight, solid, texturing
+from rts_reconstruct import (
+    contradictions,
+    detail,
+    exposures,
+    files,
+    outlining,
+    pictures,
+    points,
+    posing,
+    sight,
+    solid,
+    texturing,
+)
 from rts_reconstruct.measures import measured
 from rts_reconstruct.model import Model, moved_camera
 from rts_reconstruct.points import Points
@@ -117,21 +129,41 @@ def masked(inverted):
 
 
 def test_inverted_masks_are_refused_with_a_name_and_the_polarity():
-    with pytest.raises(rts.InputError, match=r"white along the border and black within: 0.png.*expected white where"):
+    with pytest.raises(
+        rts.InputError, match=r"white along the border and black within in 8 of 8 views \(0.png.*expected white where"
+    ):
         pictures.read(masked(range(8)), SIZE, 0)
 
 
 def test_a_mask_that_contradicts_the_others_is_named():
     assert contradictions.contradictions(pictures.read(masked(()), SIZE, 0)) == []
-    (line,) = contradictions.contradictions(pictures.read(masked([5]), SIZE, 0))
+    with pytest.warns(rts.errors.RtsWarning, match="look whether these are inverted"):
+        one = pictures.read(masked([5]), SIZE, 0)
+    (line,) = contradictions.contradictions(one)
     assert "masks contradict each other:" in line  # Of so few views none is outvoted.
     more = []
     for i, camera in enumerate(cameras(20)):
         alpha = np.asarray(rts.render(ellipsoid(), camera, (SIZE, SIZE)))[..., 3]
         image = np.full((SIZE, SIZE, 3), 0.5, np.float32)
         more.append(rts.View(camera, image, name=f"{i}.png", mask=1 - alpha if i == 5 else alpha))
-    (line,) = contradictions.contradictions(pictures.read(more, SIZE, 0))
+    with pytest.warns(rts.errors.RtsWarning, match="5.png"):
+        several = pictures.read(more, SIZE, 0)
+    (line,) = contradictions.contradictions(several)
     assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1
+
+
+def test_masks_that_are_inexact_are_told_by_their_hull():
+    def consistency(change):
+        several = []
+        for i, view in enumerate(views()):
+            image = np.array(view.image)
+            image[..., 3] = change(image[..., 3], i)
+            several.append(rts.View(view.camera, image))
+        return contradictions.consistency(pictures.read(several, SIZE, 0))
+
+    assert consistency(lambda alpha, i: alpha) > 0.9
+    assert consistency(lambda alpha, i: np.roll(alpha, 4 * (-1) ** i, axis=i // 2 % 2)) < contradictions.INEXACT
+    assert contradictions.consistency(pictures.read(views(on_white), SIZE, 0)) == 1  # Without masks.
 
 
 def test_masks_of_colmap_only_say_which_pixels_count():
@@ -225,3 +257,36 @@ def test_what_a_run_that_was_killed_had_not_finished_is_removed(tmp_path):
     (tmp_path / "mesh.obj").write_text("")
     files.forget_unfinished(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.obj"]
+
+
+# ------------------------------------------------------------------------------------------------------- exposures
+
+
+def test_exposures_that_differ_are_evened_out():
+    logs = np.random.default_rng(0).uniform(-0.15, 0.15, len(images()))
+    logs -= logs[[0, 1, 2, 4, 5, 6]].mean()  # The others are held out.
+    factors = iter(np.exp(logs))
+    taken = pictures.read(
+        views(lambda image: image * np.append(np.full(3, next(factors)), 1).astype(np.float32)), SIZE, 4
+    )
+    model = about(taken, truth())
+    found = exposures.exposures(model, taken)
+    np.testing.assert_allclose(found, logs[taken.numbers], atol=0.01)
+    even = exposures.evened(taken, found)
+    for place, view in enumerate(even.views + even.held_out):
+        image = images()[taken.numbers[place]]
+        np.testing.assert_allclose(view.image, image, atol=0.01)
+        np.testing.assert_allclose(even.given[place].image, image, atol=0.01)
+    assert exposures.exposures(model, even) is None and exposures.evened(even, None) is even
+    settings = Settings(4, 0, False, "mesh", False)
+    told = verdict(model, even, measured(model, even), [[1.0] * 20 + [0.1] * 20], 0.0, settings)
+    assert "exposures that differ by" in told.figures
+
+
+def test_a_shadow_on_less_than_half_of_a_picture_is_no_exposure():
+    shaded = [np.array(image) for image in images()]
+    for image in shaded[::2]:
+        image[: 2 * SIZE // 5, :, :3] *= 0.7
+    several = [rts.View(camera, image) for camera, image in zip(cameras(), shaded, strict=True)]
+    found = pictures.read(several, SIZE, 0)
+    assert exposures.exposures(about(found, truth()), found) is None

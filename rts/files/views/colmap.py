@@ -56,6 +56,8 @@ def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
         matrix, bounds = from_opencv(entry.rotation, entry.translation), _bounds(entry, points)
         pose = Pose(picture, entry.name, size, folder.downscale, matrix, lens, *bounds)
         poses.append(with_mask(pose, folder.mask(entry.name), folder.reduced))
+    if not any(pose.mask for pose in poses):
+        _warn_of_other_masks(folder.masks, chosen[0].name)
     if split is None:
         warn(
             f"{len(chosen)} of the {len(entries)} pictures of {file} are taken; every eighth is kept for tests: say "
@@ -88,9 +90,21 @@ def _pictures(file: Path, folder: Folder, entries: list[Entry]) -> list[Path]:
     if missing:
         named = ", ".join(name[:40] for name in missing[:3]) + (", …" if len(missing) > 3 else "")
         raise InputError(
-            f"{file} names {len(missing)} of {len(entries)} pictures that {folder.pictures} lacks: {named}"
+            f"{file} names {len(missing)} of {len(entries)} pictures that {folder.pictures} lacks: {named}; put them "
+            "there, or export the model without them"
         )
     return pictures
+
+
+def _warn_of_other_masks(folder: Path, name: str) -> None:
+    """Warn of a folder of masks in which no picture of the model has one."""
+    files = sorted(file.name for file in folder.iterdir() if file.is_file()) if folder.is_dir() else []
+    if files:
+        warn(
+            f"none of {len(files)} files of {folder} ({files[0][:40]} …) is the mask of a picture; expected names such "
+            f"as {name[:40]}.png: rename them, or no masks are used",
+            FileWarning,
+        )
 
 
 def _bounds(entry: Entry, points: Points | None) -> tuple[float | None, float | None]:

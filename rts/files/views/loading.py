@@ -74,9 +74,9 @@ def load_views(
     its picture are transparent (or background), and 0 in the mask. Cameras have no distortion.
 
     Masks: `View.mask` is the product of the pixels that are defined and of a picture, 1 where white: mask_path, "mask",
-    or beside the folder `images`, as COLMAP has it, `masks/NAME.png` (`masks/IMG.jpg.png`); pictures without one count
-    everywhere. Values are taken as they are encoded. Masks have the size of their pictures, and are made smaller with
-    them. Alpha is no mask.
+    or beside the folder `images`, as COLMAP has it, `masks/NAME.png` (`masks/IMG.jpg.png`, else `masks/IMG.png`);
+    pictures without one count everywhere. Values are taken as they are encoded. Masks have the size of their pictures,
+    and are made smaller with them. Alpha is no mask.
 
     Args:
         path: one of these files (of COLMAP's: the cameras'), or its folder, if it has one of them alone, a
@@ -111,7 +111,8 @@ def load_views(
             never loaded; or an argument is none of these.
 
     Warns:
-        FileWarning: pictures of a COLMAP model are left out, and no `split` was given.
+        FileWarning: pictures of a COLMAP model are left out, and no `split` was given; or its folder of masks has none
+            of its pictures.
     """
     path = _checked(as_path(path), split, downscale, pixel_center, frame)
     if linear not in (True, False) or cache not in (True, False):

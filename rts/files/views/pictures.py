@@ -34,9 +34,10 @@ class Folder(NamedTuple):
     reduced: int
 
     def mask(self, name: str) -> Path | None:
-        """The mask of a picture, called as COLMAP calls it: NAME.png, or as a picture that is a PNG itself; or None."""
-        for mask in (name + ".png", name if name.lower().endswith(".png") else None):
-            if mask and os.path.isfile(self.masks / mask):  # False, too, for a name that is too long.
+        """The mask of a picture: NAME.png as COLMAP calls it, or the name with .png in place of its ending; or None."""
+        same = name if name.lower().endswith(".png") else os.path.splitext(name)[0] + ".png"
+        for mask in (name + ".png", same):
+            if os.path.isfile(self.masks / mask):  # False, too, for a name that is too long.
                 return inside(self.masks, mask, self.masks, self.masks)
         return None
 
