@@ -1,5 +1,6 @@
 """Plugins by name: what is found, what is loaded, and what the errors say."""
 
+import importlib
 import json
 import operator
 import re
@@ -221,6 +222,8 @@ def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(instal
 def test_names_of_earlier_versions_tell_what_there_is_instead():
     with pytest.raises(AttributeError, match="^rts.transforms is gone since 0.2: rts.Camera.look_at, .perspective"):
         rts.transforms  # noqa: B018
+    with pytest.raises(ImportError, match="^rts.transforms is gone since 0.2: rts.Camera.look_at, .perspective"):
+        importlib.import_module("rts.transforms")
     for name, instead in rts._GONE.items():
         assert not hasattr(rts, name)
         for path in re.findall(r"rts\.([\w.]*\w)", instead):
