@@ -44,7 +44,7 @@ class Engine(Plugin):
         """
 
     def arange(self, count: int, like: Array) -> Array:
-        """The numbers (count,) from 0 on, in the dtype of `like`, which is floating, and on its device."""
+        """The numbers (count,) from 0 on, in the dtype of `like`, float32 or float64, and on its device."""
         return self.constant(np.arange(float(count)), like)
 
     @abc.abstractmethod

@@ -42,7 +42,8 @@ HINTS = {
 """Advice for the stage that takes most."""
 
 SPINNING = (
-    "\nTorch was imported before rts: its idle threads take cores. Import rts first, or set OMP_WAIT_POLICY=PASSIVE."
+    "\nTorch was imported before rts: its idle threads may take cores. "
+    "Import rts first, or set OMP_WAIT_POLICY=PASSIVE."
 )
 
 

@@ -41,7 +41,7 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, height, width)
     # By squares; in each of them clockwise, part by part if outlines may cross.
     group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
-    order = np.argsort(5.0 * group + along, kind="stable")  # Places along are 0 to 4: one key sorts faster than two.
+    order = np.argsort(group + 1j * along, kind="stable")  # By both parts, and faster than lexsort.
     square, ends = square.take(order), ends.take(order, 0)
     begins = np.append(np.flatnonzero(np.diff(group[order], prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)

@@ -6,7 +6,7 @@ from typing import Any
 
 from array_api_compat import torch as _compat
 from array_api_compat.torch import *  # noqa: F403  # pyright: ignore[reportWildcardImportFromLibrary]
-from torch import Tensor, clamp
+from torch import Tensor, clamp, compiler
 
 
 def take(x: Tensor, indices: Tensor, /, *, axis: int | None = None) -> Tensor:
@@ -15,7 +15,7 @@ def take(x: Tensor, indices: Tensor, /, *, axis: int | None = None) -> Tensor:
 
 
 def clip(x: Tensor, /, min: Any = None, max: Any = None) -> Tensor:
-    """`x` between bounds, which are not NaN: of sizes, `torch.compile` cannot ask this, and array_api_compat does."""
-    if isinstance(min, Tensor) or isinstance(max, Tensor):
-        return _compat.clip(x, min, max)
-    return clamp(x, min, max)
+    """`x` between bounds. array_api_compat asks whether they are NaN, which `torch.compile` cannot trace of sizes."""
+    if compiler.is_compiling() and not isinstance(min, Tensor) and not isinstance(max, Tensor):
+        return clamp(x, min, max)
+    return _compat.clip(x, min, max)

@@ -54,7 +54,8 @@ class TorchEngine(Engine):
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
         """`value` on the device of `like`, else on the CPU; floats as float64 if `like` is, else as float32.
 
-        Read-only tables of integers, such as a mesh's faces, are sent to a device once, and kept as long as they live.
+        Read-only tables of integers, such as a mesh's faces, are sent to a device once, and kept as long as they live:
+        their numbers must stay, and nobody may change the result in place.
         """
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
@@ -68,7 +69,11 @@ class TorchEngine(Engine):
         key = id(array), device
         kept = _sent.get(key)
         if kept is None or kept[0]() is not array:
-            kept = _sent[key] = weakref.ref(array, lambda _: _sent.pop(key, None)), to_tensor(array, device)
+            with torch.inference_mode(False):  # Gradients may need it later.
+                sent = to_tensor(array, device)
+            if type(sent) is not torch.Tensor:  # Of a mode that stands in for torch.
+                return sent
+            kept = _sent[key] = weakref.ref(array, lambda _: _sent.pop(key, None)), sent
         return kept[1]
 
     def arange(self, count: int, like: torch.Tensor) -> torch.Tensor:

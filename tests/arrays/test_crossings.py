@@ -10,10 +10,12 @@ from helpers import icosphere
 import rts
 
 torch = pytest.importorskip("torch")
-crossings = pytest.importorskip("benchmarks.gpu.crossings")
+
+from benchmarks.gpu import crossings  # noqa: E402
+from benchmarks.speed.pose_iteration import Task  # noqa: E402
+
 pytestmark = pytest.mark.devices
 
-Task = pytest.importorskip("benchmarks.speed.pose_iteration").Task
 VERTICES, FACES = icosphere(2)
 SIDE = 24
 

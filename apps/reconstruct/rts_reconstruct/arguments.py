@@ -41,8 +41,11 @@ def check_other_folder(folder: Path, views: Any) -> None:
     """Refuse to write into the folder of the data set, or of its pictures, which results would be mixed with."""
     if not isinstance(views, (str, Path)):
         return
-    data = Path(views) if Path(views).is_dir() else Path(views).parent
-    if folder.resolve() in {place.resolve() for place in (data, data / "images", data / "masks", data / "sparse")}:
+    data = (Path(views) if Path(views).is_dir() else Path(views).parent).resolve()
+    while data.name in ("0", "sparse", "images"):  # Of a folder of COLMAP.
+        data = data.parent
+    parts, target = [data / name for name in ("images", "masks", "sparse")], folder.resolve()
+    if target == data or any(target.is_relative_to(part) for part in parts):
         raise rts.InputError(
             f"the folder to write into, {folder}, is that of the pictures; expected another one, such as "
             f"{data / 'reconstruction'}"

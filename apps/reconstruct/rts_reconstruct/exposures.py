@@ -27,11 +27,14 @@ def exposures(model: Model, pictures: Pictures) -> np.ndarray | None:
 
     They are logarithms of factors on encoded colours, 0 in the mean of the views to fit. Each is the median over
     pixels of the difference between picture and render, of log grey values: shadows and wrong masks count little.
+    None, too, for pictures on a plain background, which has one colour in all of them.
 
     Args:
         model: a model that was fitted to the pictures.
         pictures: the pictures as they are.
     """
+    if not pictures.outlined:
+        return None
     found = np.zeros(len(pictures.numbers))
     for place, view in enumerate(pictures.views + pictures.held_out):
         camera = camera_of(model, pictures, place, view.camera)
@@ -42,8 +45,8 @@ def exposures(model: Model, pictures: Pictures) -> np.ndarray | None:
         if image.shape[2] == 4:
             counts &= image[..., 3] > INSIDE
         pair = [x[..., :3].mean(axis=2)[counts] for x in (image, render)]
-        told = [(x > DARK) & (x < BRIGHT) for x in pair]
-        differences = np.log(np.maximum(pair[0], DARK) / np.maximum(pair[1], DARK))[told[0] & told[1]]
+        usable = np.all([(x > DARK) & (x < BRIGHT) for x in pair], axis=0)
+        differences = np.log(pair[0][usable] / pair[1][usable])
         found[place] = np.median(differences) if len(differences) >= FEWEST else np.nan
     fitted = found[: len(pictures.views)]
     if np.isfinite(fitted).sum() < 2:
@@ -76,5 +79,5 @@ def _scaled(view: rts.View, factor: float, keep: bool) -> rts.View:
         return view.mask
 
     reading = functools.cache(image) if keep else image
-    own = None if view.mask is None else mask
-    return rts.View(view.camera, reading, view.size, name=view.name, mask=own, path=view.path, lens=view.lens)
+    same = None if view.mask is None else mask
+    return rts.View(view.camera, reading, view.size, name=view.name, mask=same, path=view.path, lens=view.lens)

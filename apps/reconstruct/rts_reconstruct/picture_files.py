@@ -19,7 +19,7 @@ MOST = 3
 
 def turned(views: Sequence[rts.View]) -> list[str]:
     """A line on pictures of a data set whose EXIF turns them, which nothing here does; none without."""
-    names = [file.name for file in _files(views) if _orientation(file) in range(2, 9)]
+    names = [file.name for file in map(_file, views) if file is not None and _orientation(file) in range(2, 9)]
     if not names:
         return []
     return [
@@ -30,16 +30,15 @@ def turned(views: Sequence[rts.View]) -> list[str]:
 
 def repeated(views: Sequence[rts.View]) -> list[str]:
     """A line on pictures of a data set that are the same file with different cameras; none without."""
-    sizes: dict[int, list[rts.View]] = defaultdict(list)
+    sizes: dict[int, list[tuple[rts.View, Path]]] = defaultdict(list)
     for view in views:
-        if view.path is not None and view.path.is_file():
-            sizes[view.path.stat().st_size].append(view)
+        if (file := _file(view)) is not None:
+            sizes[file.stat().st_size].append((view, file))
     alike: dict[bytes, list[rts.View]] = defaultdict(list)
     for candidates in sizes.values():
         if len(candidates) > 1:
-            for view in candidates:
-                assert view.path is not None
-                alike[hashlib.sha256(view.path.read_bytes()).digest()].append(view)
+            for view, file in candidates:
+                alike[hashlib.sha256(file.read_bytes()).digest()].append(view)
     pairs = []
     for first, *others in alike.values():
         pairs += [f"{v.name} is {first.name}" for v in others if not np.allclose(v.camera.view, first.camera.view)]
@@ -51,13 +50,19 @@ def repeated(views: Sequence[rts.View]) -> list[str]:
     ]
 
 
-def _files(views: Sequence[rts.View]) -> list[Path]:
-    return [view.path for view in views if view.path is not None and view.path.is_file()]
+def _file(view: rts.View) -> Path | None:
+    """The file of a view's picture, if it is there."""
+    file = None if view.path is None else Path(view.path)
+    return file if file is not None and file.is_file() else None
 
 
 def _orientation(file: Path) -> int:
-    with Image.open(file) as picture:
-        return int(picture.getexif().get(ORIENTATION) or 1)
+    """The EXIF's; 1, not turned, for a file that Pillow does not know."""
+    try:
+        with Image.open(file) as picture:
+            return int(picture.getexif().get(ORIENTATION) or 1)
+    except (OSError, ValueError):
+        return 1
 
 
 def _some(names: Sequence[str]) -> str:

@@ -161,7 +161,8 @@ def _notes(shots: pictures.Pictures, folder: Path, consistent: float) -> list[st
     if consistent < INEXACT:
         notes.append(
             f"masks overlap with pictures of what they have in common by {consistent:.2f} in the median, where right "
-            "ones do by some 0.9: they are inexact, and large differences count less in the fit"
+            "ones do by some 0.9: they are inexact, or cameras are off, for which there is --fit-cameras; large "
+            "differences count less in the fit"
         )
     if shots.by_points and shots.region is not None:
         ball = ",".join(f"{x:.4g}" for x in (*shots.region.center, shots.region.unit))

@@ -100,8 +100,8 @@ class Run:
     def begin(self, resume: bool) -> None:
         """Read what an earlier run has kept, or forget it."""
         if resume and (kept := job.shared(self.saved.read)) is not None:
-            self.model, self.losses, self.seconds = kept
-            self._even()
+            self.model, self.losses, self.seconds, found = kept
+            self.pictures = evened(self._taken, found)
         elif not resume and self.first:
             self.saved.forget()
         self._started = time.perf_counter() - self.seconds
@@ -117,12 +117,9 @@ class Run:
         fit = fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces)))
         if self.settings.cameras:
             fit = posing.refined(fit, self.pictures, self.settings)
+        # Exposures of pictures, as the model tells them, are taken out of what is fitted next.
+        self.pictures = evened(self._taken, job.shared(lambda: exposures(fit, self._taken)))
         self._keep(fit, losses)
-        self._even()
-
-    def _even(self) -> None:
-        """Take the exposures of pictures, as the model tells them, out of what is fitted next."""
-        self.pictures = evened(self._taken, job.shared(lambda: exposures(self.model, self._taken)))
 
     def texture(self, number: int, size: int, steps: int) -> None:
         """The stage of the texture, unless an earlier run made it; one that was stopped is baked alone."""
@@ -157,7 +154,7 @@ class Run:
         if self.first:
             with writing(self.folder):
                 self.files = files.write_mesh(self.folder, model, self.pictures)
-                self.saved.write(model, self.losses, self.seconds)
+                self.saved.write(model, self.losses, self.seconds, self.pictures.exposures)
 
     def finish(self, light: bool) -> Reconstruction:
         """Add detail, tell light from colours if asked to, measure all views, and write the rest."""
@@ -170,7 +167,7 @@ class Run:
         self.model = job.shared(lambda: detail.detailed(self.model, self.pictures))
         if light:
             self.model = job.shared(lambda: texturing.in_even_light(self.model))
-        rows = measures.measured(self.model, self.pictures)
+        rows = job.shared(lambda: measures.measured(self.model, self.pictures))  # The verdict's fits follow from them.
         unseen = sight.unseen_share(self.model, known)
         told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))

@@ -34,19 +34,22 @@ class Saved:
         for file in (self.file, *self.folder.glob("stage_*.npz")):
             file.unlink(missing_ok=True)
 
-    def write(self, model: Model, losses: list[list[float]], seconds: float) -> None:
-        """Keep the model after a stage; `losses` has a list for each stage so far."""
+    def write(
+        self, model: Model, losses: list[list[float]], seconds: float, exposures: np.ndarray | None = None
+    ) -> None:
+        """Keep the model after a stage; `losses` has a list for each stage so far. See `Pictures` for exposures."""
         arrays = {name: x for name, x in model._asdict().items() if name != "atlas" and x is not None}
         if model.atlas is not None:
             arrays |= {f"atlas_{name}": x for name, x in model.atlas._asdict().items()}
-        about = json.dumps({"identity": self.identity, "losses": losses, "seconds": seconds})
+        even = None if exposures is None else exposures.tolist()
+        about = json.dumps({"identity": self.identity, "losses": losses, "seconds": seconds, "exposures": even})
         beside = self.folder / "stages.new.npz"
         np.savez(beside, about=np.array(about), **arrays)
         os.replace(beside, self.file)
         self.running(len(losses) - 1).unlink(missing_ok=True)
 
-    def read(self) -> tuple[Model, list[list[float]], float] | None:
-        """The model after the last stage that ended, losses of each stage, and the seconds taken; None if none ended.
+    def read(self) -> tuple[Model, list[list[float]], float, np.ndarray | None] | None:
+        """What `write` kept after the last stage that ended; None if none ended.
 
         Raises:
             InputError: the file is damaged, or of a reconstruction with other settings.
@@ -60,10 +63,11 @@ class Saved:
             atlas = {n.removeprefix("atlas_"): arrays.pop(n) for n in list(arrays) if n.startswith("atlas_")}
             model = Model(**arrays, atlas=Atlas(**atlas) if atlas else None)
             before, losses, seconds = about["identity"], about["losses"], about["seconds"]
+            exposures = None if about["exposures"] is None else np.array(about["exposures"])
         except Exception:  # NumPy raises many kinds, some with the advice to load pickles.
             raise rts.InputError(f"{self.file} is damaged; leave out --resume to begin again") from None
         other = [name for name, value in self.identity.items() if before.get(name) != value]
         if other:
             changes = ", ".join(f"{name} was {before.get(name)!r:.40}" for name in other)
             raise rts.InputError(f"{self.folder} is of other settings ({changes}); give the same, or begin again")
-        return model, losses, seconds
+        return model, losses, seconds, exposures

@@ -94,7 +94,8 @@ def verdict(
     if away is not None and away[1] > AWAY:
         findings.append("the mesh is far from COLMAP's points: its outlines are of something else, or --region is")
     first, last = _ends(losses)
-    if last > FALLEN * first and psnr < 20:
+    # A robust loss, which later stages have, does not compare with the first stage's.
+    if last > FALLEN * first and psnr < 20 and not settings.robust:
         findings.append(f"the loss has not fallen ({first:.2g} → {last:.2g}): give more --steps, or another --start")
     findings += _disagreeing(model, pictures, rows, settings)
     angle = points.span(pictures.views, np.zeros(3))

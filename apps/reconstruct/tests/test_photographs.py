@@ -1,5 +1,7 @@
 """Pictures that come without masks, or with wrong ones: points, solids, outlines, verdicts."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -281,6 +283,7 @@ def test_exposures_that_differ_are_evened_out():
     settings = Settings(4, 0, False, "mesh", False)
     told = verdict(model, even, measured(model, even), [[1.0] * 20 + [0.1] * 20], 0.0, settings)
     assert "exposures that differ by" in told.figures
+    assert exposures.exposures(model, dataclasses.replace(taken, outlined=False)) is None  # Its background is one.
 
 
 def test_a_shadow_on_less_than_half_of_a_picture_is_no_exposure():

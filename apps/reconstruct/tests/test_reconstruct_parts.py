@@ -233,9 +233,11 @@ def test_measures_of_the_truth_are_best():
 
 def test_what_is_kept_is_read_again_and_refused_for_other_settings(tmp_path):
     model = texturing.baked(ball(1), 16)
+    Saved(tmp_path, {"seed": 0}).write(model, [[1.0, 0.5]], 3.0, np.array([0.1, -0.1]))
+    again, losses, seconds, exposures = Saved(tmp_path, {"seed": 0}).read()
+    assert (losses, seconds, exposures.tolist()) == ([[1.0, 0.5]], 3.0, [0.1, -0.1])
     Saved(tmp_path, {"seed": 0}).write(model, [[1.0, 0.5]], 3.0)
-    again, losses, seconds = Saved(tmp_path, {"seed": 0}).read()
-    assert (losses, seconds) == ([[1.0, 0.5]], 3.0)
+    assert Saved(tmp_path, {"seed": 0}).read()[3] is None
     np.testing.assert_array_equal(again.atlas.texture, model.atlas.texture)
     with pytest.raises(rts.InputError, match="seed was 0"):
         Saved(tmp_path, {"seed": 1}).read()

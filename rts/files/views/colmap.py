@@ -98,7 +98,7 @@ def _pictures(file: Path, folder: Folder, entries: list[Entry]) -> list[Path]:
 
 def _warn_of_other_masks(folder: Path, name: str) -> None:
     """Warn of a folder of masks in which no picture of the model has one."""
-    files = sorted(file.name for file in folder.iterdir() if file.is_file()) if folder.is_dir() else []
+    files = [x.name for x in sorted(folder.iterdir()) if x.is_file() and x.name[0] != "."] if folder.is_dir() else []
     if files:
         warn(
             f"none of {len(files)} files of {folder} ({files[0][:40]} …) is the mask of a picture; expected names such "
