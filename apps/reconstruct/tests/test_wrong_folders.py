@@ -43,24 +43,21 @@ def photographs(folder, names=("a.png", "b.png", "c.png")):
 
 def masked(change, numbers=range(COUNT)):
     """A data set with masks (H, W) that a function changes."""
-
-    def make(folder):
-        folder = colmap(folder)
-        for i in numbers:
-            file = folder / f"masks/{i}.png.png"
-            Image.fromarray(np.ascontiguousarray(change(np.array(Image.open(file))))).save(file)
-        return folder
-
-    return make
+    return repainted(colmap, "masks/{}.png.png", change, numbers)
 
 
 def painted(change):
     """A data set whose pictures (H, W, 4) a function changes."""
+    return repainted(blender, "{}.png", change, range(COUNT))
+
+
+def repainted(data, name, change, numbers):
+    """A data set whose files, `name` of numbers, a function changes as arrays."""
 
     def make(folder):
-        folder = blender(folder)
-        for i in range(COUNT):
-            file = folder / f"{i}.png"
+        folder = data(folder)
+        for i in numbers:
+            file = folder / name.format(i)
             Image.fromarray(np.ascontiguousarray(change(np.array(Image.open(file))))).save(file)
         return folder
 

@@ -11,8 +11,6 @@ import rts
 
 BLOCKS = 10
 """Blocks along the longer side of the pixels that change."""
-GRIDS = 4
-"""Ways to cut them into blocks."""
 STEP = 1e-3
 """Step of differences of a loss's slope, in units of residuals."""
 UNDETERMINED = 1e-6
@@ -57,15 +55,15 @@ def covariance_of(
     y, x, first, second = (np.concatenate(of_views) for of_views in zip(*moments, strict=True))
     hessian = second.sum(axis=0)
     _refuse_open(hessian, names)
-    total = np.zeros_like(hessian)
-    for block in _blocks(y - y.min(), x - x.min()):
+    total, grids = np.zeros_like(hessian), _blocks(y - y.min(), x - x.min())
+    for block in grids:
         count = block.max() + 1
         slopes, curvatures = np.zeros((count, *first.shape[1:])), np.zeros((count, *second.shape[1:]))
         np.add.at(slopes, block, first)
         np.add.at(curvatures, block, second)
         moves = np.linalg.solve(hessian - curvatures, slopes[..., None])[..., 0]
         total += moves.T @ moves * (count - 1) / count
-    return total / GRIDS
+    return total / len(grids)
 
 
 def _slope(r: torch.Tensor, loss: rts.Loss) -> np.ndarray:
