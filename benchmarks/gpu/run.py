@@ -5,7 +5,7 @@
 The machine has packages of its own, such as torch or jax with CUDA. The tree is installed beside them without its
 dependencies, into a folder that is deleted afterwards; packages that the machine lacks come from a folder of wheels:
 
-    python3 -m pip download --no-deps --only-binary=:all: --python-version 3.12 -d .wheels trimesh mapbox-earcut …
+    python3 -m pip download --no-deps --only-binary=:all: --python-version 3.12 -d .wheels setuptools trimesh …
 
 Under OUT are then `gpu.json` (versions, counts of tests, tables) and `gpu.log` (all that was printed). What does not
 fit into the minutes is left out, and the JSON says so. This file imports the standard library alone.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -29,7 +30,11 @@ from typing import Any, TextIO
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("torch", "jax", "jaxlib", "numpy", "numba", "triton", "array-api-compat", "trimesh", "scipy", "optax")
 NEEDED = ("array-api-compat", "mapbox-earcut", "trimesh", "typer", "rich", "numba", "scipy", "pillow", "hypothesis")
+NEEDED += ("platformdirs", "xxhash")
 """Packages without which no test runs."""
+
+MOST_WORKERS = 8
+"""Processes that run tests, each with a context of its own on the GPU."""
 
 LEAST = 30.0
 """Seconds that must be left for another step to begin."""
@@ -142,8 +147,27 @@ def main() -> int:
             steps.run("packages", sys.executable, "-c", missing)
             steps.run("loops compiled", sys.executable, "-m", "rts", "warmup", share=0.3)
             if options.only != "tables":
-                tests = [sys.executable, "-m", "pytest", "-m", "devices", "-p", "no:cacheprovider", "--tb=short", "-q"]
-                steps.run("tests", *tests, f"--junitxml={out / 'tests.xml'}", "tests", share=0.55)
+                tests = [
+                    sys.executable,
+                    "-m",
+                    "pytest",
+                    "-m",
+                    "devices",
+                    "-p",
+                    "no:cacheprovider",
+                    "-p",
+                    "no:benchmark",
+                ]
+                tests += ["--tb=short", "-q"]
+                if importlib.util.find_spec("xdist"):
+                    tests += ["-n", str(min(os.cpu_count() or 1, MOST_WORKERS))]
+                steps.run(
+                    "tests",
+                    *tests,
+                    f"--junitxml={out / 'tests.xml'}",
+                    "tests/arrays",
+                    share=1.0 if options.only else 0.55,
+                )
                 found["tests"] = counts(out / "tests.xml")
             if options.only != "tests":
                 seconds = str(max(steps.until - time.monotonic() - LEAST, 0))

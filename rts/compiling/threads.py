@@ -27,7 +27,7 @@ TASKS_PER_THREAD = 4
 """Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
-"""Nanoseconds of work below which a loop stays on its caller's thread: to wake another takes tens of thousands."""
+"""Nanoseconds of work for which one more thread is woken, which takes tens of thousands, and the interpreter lock."""
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -202,7 +202,7 @@ def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, off_caller_core: bool = True) -> None:
+def parallel(loop: Callable, count: int, *args: Any, work: int | None = None, off_caller_core: bool = True) -> None:
     """Call `loop(start, stop, *args)` on all cores, in ranges that together cover [0, count); return when all are done.
 
     The caller's thread alone runs a loop of little `work`, as one range, and one for which no helper is free. An error
@@ -212,15 +212,18 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, of
         loop: a function of (start, stop, *args) that releases the interpreter lock.
         count: the end of the range.
         *args: passed on.
-        work: rough time of all ranges on one thread, nanoseconds. The default is just enough for helpers to be asked.
+        work: rough time of all ranges on one thread, nanoseconds; one helper is asked for each LITTLE_WORK of it. None
+            asks all.
         off_caller_core: whether helpers must stay off the caller's core all the time. The loop must then start no
             threads, which would have to stay off as well.
     """
     # Inside a task of another loop no helper may be free, and asking takes time.
-    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
+    little = work is not None and work < LITTLE_WORK
+    if little or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
         loop(0, count, *args)
         return
-    tasks = min(count, threads * TASKS_PER_THREAD)
+    free = free if work is None else min(free, work // LITTLE_WORK)  # To wake one more would take longer than it saves.
+    tasks = min(count, (free + 1) * TASKS_PER_THREAD)
     bounds = [count * i // tasks for i in range(tasks + 1)]
     numbers, failed = itertools.count(), False
 

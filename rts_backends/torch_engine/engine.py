@@ -153,9 +153,8 @@ class TorchEngine(Engine):
     def segment_sum(self, values: torch.Tensor, segments: torch.Tensor | np.ndarray, count: int) -> torch.Tensor:
         """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
         index = segments if isinstance(segments, torch.Tensor) else to_tensor(segments, values.device)
-        return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(
-            0, index, values
-        )
+        sums = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device)
+        return sums.index_add(0, index.long(), values)  # On a CPU torch takes ten times as long for other integers.
 
     def to_numpy(self, x: torch.Tensor) -> np.ndarray:
         """The value on the host."""

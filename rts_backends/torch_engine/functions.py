@@ -58,8 +58,9 @@ def tangent_alike(x: Tensor) -> Tensor:
 
 
 def on_host(x: Tensor) -> np.ndarray:
-    """The value of a tensor in the memory of the host: a view, or new zeros for torch's zeros without memory."""
-    return x.numpy(force=True)  # Forward mode makes up zeros without memory, which NumPy gets by force alone.
+    """The value of a tensor in the memory of the host: a view, a copy from a device, or new zeros if it has no memory."""
+    # Forward mode makes up zeros without memory, which NumPy gets by force alone.
+    return (x if x.is_cpu else x.cpu()).numpy(force=True)
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

@@ -18,6 +18,7 @@ from torch import Tensor
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
 from rts_backends.torch_engine.functions import along, foreign, on_host, transformed
+from rts_backends.torch_engine.host_call import to_tensor
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -29,7 +30,7 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
     The array code also runs under `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
+    if not _fits(operation, operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
     return _Value.apply(_Call(operation, params), *[x.contiguous() for x in operands])
@@ -47,13 +48,16 @@ class _Specifying(threading.local):
 _specifying = _Specifying()
 
 
-def _fits(operands: Sequence[Tensor]) -> bool:
-    """True if compiled code takes these operands: on the host, floats all float32 or all float64, the rest integers."""
+def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
+    """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
+
+    They are on the host, or cross to it.
+    """
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
     for x in operands:
-        if not x.is_cpu or (x.dtype != real and x.dtype not in _INTEGERS):
+        if not (x.is_cpu or operation.crosses) or (x.dtype != real and x.dtype not in _INTEGERS):
             return False
     return True
 
@@ -146,7 +150,7 @@ class _Value(torch.autograd.Function):
     @staticmethod
     def forward(call, *operands):
         out, call.kept = call.operation.value_on_host(_host(operands), call.params)
-        return torch.from_numpy(out)
+        return to_tensor(out, operands[0].device)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -197,7 +201,7 @@ class _Pull(torch.autograd.Function):
         found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
         results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
-        return tuple(map(torch.from_numpy, found))
+        return tuple(to_tensor(x, arrays[0].device) for x in found)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -243,7 +247,7 @@ class _Push(torch.autograd.Function):
         shape = call.operation.result_shape(*(x.shape for x in operands), **call.params)
         out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
         call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)
-        return torch.from_numpy(out)
+        return to_tensor(out, arrays[0].device)
 
     @staticmethod
     def setup_context(ctx, inputs, output):

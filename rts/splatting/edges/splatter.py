@@ -88,7 +88,7 @@ class Edges(SummingSplatter):
         background: Array | None = None,
         loss: Any = None,
     ) -> tuple[Array, Array, Array] | None:
-        """See `SummingSplatter`; None without outlines, where light passes through, and off the host."""
+        """See `SummingSplatter`; None without outlines, and where light passes through."""
         outlines, engine = splats.outlines, engine_of(splats.positions)
         tree = (
             splats.positions,
@@ -102,7 +102,7 @@ class Edges(SummingSplatter):
             background,
         )
         operands = collected(tree)
-        if outlines is None or outlines.stack is not None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
+        if outlines is None or outlines.stack is not None or splats.rgba.shape[0] == 0:
             return None
 
         def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -468,5 +468,6 @@ EDGES = Operation(
     pull=edges_weights.pull,
     differentiable=2,
     keeps=True,
+    crosses=True,
 )
 """The image (H, W, C) of positions (N, 3), colours (N, C), `row` (H, W), and the fields of `Outlines`."""
