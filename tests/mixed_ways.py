@@ -180,7 +180,7 @@ def _patched(way):
     with pytest.MonkeyPatch.context() as patch:
         if "threads" in way:
             patch.setenv("RTS_NUM_THREADS", "4")
-            patch.setattr(threads, "LITTLE_WORK", 0)
+            patch.setattr(threads, "LITTLE_WORK", 1)
         if "specified" in way:
             patch.setattr(edges, "EDGES", edges._specification)
             patch.setattr(edges, "CELLS", edges_stacks._specification)

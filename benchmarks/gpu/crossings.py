@@ -95,7 +95,7 @@ def names(crossings: list[Crossing]) -> list[str]:
         if crossing.shape in ((), (1,), (3,), (4, 4)):
             known.append(NUMBERS)
             continue
-        known.append(ORDER[call][found[call]] if call in ORDER else call[1])
+        known.append(ORDER[call][found[call]] if call in ORDER else OF_OPERATIONS.get(call, call[1]))
         found[call] += 1
     return known
 
@@ -110,6 +110,13 @@ ORDER = {
     ("to the device", "_vertex_normals"): ("faces",),
 }
 """The arrays that cross in a call, in their order, numbers and matrices left out."""
+OF_OPERATIONS = {
+    ("to the host", "__call__"): "operands of the splat",
+    ("to the device", "__call__"): "image",
+    ("to the host", "outside"): "gradient of the image",
+    ("to the device", "outside"): "gradients of samples",
+}
+"""What crosses where operations are computed on the host, by its call; autograd calls from outside the library."""
 
 
 def counted(task: Task, device: str) -> tuple[list[Crossing], dict[str, int]]:

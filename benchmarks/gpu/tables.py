@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rts
-from benchmarks.meshes import MESHES, kept_mesh
+from benchmarks.meshes import kept_mesh
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import RATE, START
 

@@ -58,7 +58,7 @@ def tangent_alike(x: Tensor) -> Tensor:
 
 
 def on_host(x: Tensor) -> np.ndarray:
-    """The value of a tensor in the memory of the host: a view, a copy from a device, or new zeros if it has no memory."""
+    """The value of a tensor in the memory of the host: a view, or a copy if it is on a device or has no memory."""
     # Forward mode makes up zeros without memory, which NumPy gets by force alone.
     return (x if x.is_cpu else x.cpu()).numpy(force=True)
 

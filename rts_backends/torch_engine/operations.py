@@ -69,15 +69,24 @@ class _Call:
     call of its own.
     """
 
-    __slots__ = ("count", "kept", "operation", "params")
+    __slots__ = ("_crossed", "count", "kept", "operation", "params")
 
     def __init__(self, operation: Operation, params: Mapping[str, Any]):
         self.operation, self.params = operation, params
         self.count, self.kept = operation.differentiable, None
+        self._crossed: list[np.ndarray] | None = None
 
     def another(self) -> _Call:
         """A call of this operation with these parameters, at other operands."""
         return _Call(self.operation, self.params)
+
+    def on_host(self, operands: Sequence[Tensor]) -> list[np.ndarray]:
+        """The operands on the host, always the same; they cross from a device once."""
+        if operands[0].is_cpu:
+            return _host(operands)
+        if self._crossed is None:
+            self._crossed = _host(operands)
+        return self._crossed
 
     def split(self, operands: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
         """The differentiable operands at the head of `operands`, and the rest."""
@@ -149,7 +158,7 @@ class _Value(torch.autograd.Function):
 
     @staticmethod
     def forward(call, *operands):
-        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
+        out, call.kept = call.operation.value_on_host(call.on_host(operands), call.params)
         return to_tensor(out, operands[0].device)
 
     @staticmethod
@@ -197,7 +206,7 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(call, wanted, *arrays):
-        *operands, g = _host(arrays)
+        operands, (g,) = call.on_host(arrays[:-1]), _host(arrays[-1:])
         found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
         results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
@@ -243,7 +252,7 @@ class _Push(torch.autograd.Function):
     @staticmethod
     def forward(call, present, *arrays):
         count = sum(present)
-        operands, tangents = _host(arrays[:-count]), _host(arrays[-count:])
+        operands, tangents = call.on_host(arrays[:-count]), _host(arrays[-count:])
         shape = call.operation.result_shape(*(x.shape for x in operands), **call.params)
         out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
         call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)

@@ -45,11 +45,15 @@ def test_samples_and_breaks_cross_by_their_sizes(step):
     assert sums["to the device", "barycentrics"] == 8 * rows
     assert sums["to the device", "rows of breaks"] == 24 * breaks and sums["to the device", "slopes"] == 16 * breaks
     assert sums["to the host", "vertices"] == 12 * len(VERTICES)
+    # Operands cross once, for the value and the derivative.
+    assert sums["to the device", "image"] == sums["to the host", "gradient of the image"] == 16 * cells
+    assert sums["to the device", "gradients of samples"] == sums["to the device", "ids"] // 12 * 28 + 28 * 2 * breaks
 
 
 @pytest.mark.thorough
 def test_every_crossing_has_a_name_and_faces_cross_once(step):
     known = {name for names in crossings.ORDER.values() for name in names} | {crossings.NUMBERS}
+    known |= set(crossings.OF_OPERATIONS.values())
     assert set(crossings.names(step)) <= known
     assert not bytes_by_name(step)["to the device", "faces"]
     with elsewhere.Device():

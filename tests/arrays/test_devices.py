@@ -364,6 +364,51 @@ def test_a_target_on_another_device_is_refused_in_one_line(place):
         rts.fit(rts.ImageResiduals(posed, CAMERA, SIZE, target), place.put({"pose": POSE}), steps=2, progress=False)
 
 
+# ------------------------------------------------------------------------------------------------------ operations
+
+
+def _scaled(crosses, calls):
+    """The operation x · k of arrays (N, 2) and (2,), which notes the calls of its compiled functions."""
+
+    def forward(operands, out):
+        calls.append("forward")
+        np.multiply(*operands, out=out)
+
+    def pull(operands, g, results):
+        calls.append("pull")
+        if results[0] is not None:
+            results[0][...] = g * operands[1]
+        if results[1] is not None:
+            results[1][...] = (g * operands[0]).sum(0)
+
+    def push(operands, tangents, out):
+        calls.append("push")
+        dx, dk = tangents
+        out[...] = (0 if dx is None else dx * operands[1]) + (0 if dk is None else operands[0] * dk)
+
+    functions = {"forward": forward, "push": push, "pull": pull}
+    return rts.plugin_api.operations.Operation(
+        f"tests.scaled_{crosses}", lambda x, k: x * k, (2, 1), lambda x, k: x, **functions, differentiable=2,
+        crosses=crosses,
+    )  # fmt: skip
+
+
+def test_operations_that_cross_run_their_compiled_functions_for_torch(place):
+    x, k = RNG.normal(size=(5, 2)), np.array([2.0, -3.0])
+    for crosses in (False, True):
+        calls = []
+        scaled = _scaled(crosses, calls)
+        tree = place.put([x, k])
+        value, slopes = place.gradient(lambda t, f=scaled: (f(*t) ** 2).sum(), tree)
+        assert float(place.take(value)) == pytest.approx(((x * k) ** 2).sum(), rel=1e-5)
+        for found, expected in zip(place.take(slopes), (2 * x * k * k, (2 * x * x * k).sum(0)), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
+        _, moved = place.tangent(lambda t, f=scaled: f(*t), tree, place.put([x, k]))
+        np.testing.assert_allclose(place.take(moved), 2 * x * k, rtol=1e-5)
+        compiled = crosses and place.engine == "torch"
+        assert set(calls) == ({"forward", "pull", "push"} if compiled else set())
+
+
 # ---------------------------------------------------------------------------------- the command for machines with a GPU
 
 

@@ -150,6 +150,22 @@ def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
     assert sum(done) == 8 * 20 * 9
 
 
+def test_only_as_many_threads_are_asked_as_there_is_work_for(monkeypatch, helpers):
+    from rts.compiling import threads
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "4")
+    asked = []
+    monkeypatch.setattr(helpers, "ask", lambda job: asked.append(job))
+    little = threads.LITTLE_WORK
+    for work, expected in ((little - 1, 0), (little, 1), (2 * little + 1, 2), (100 * little, 3), (None, 3)):
+        asked.clear()
+        ranges = []
+        threads.parallel(lambda start, stop, ranges=ranges: ranges.append((start, stop)), 1000, work=work)
+        assert len(asked) == expected
+        assert [a for a, _ in ranges[1:]] == [b for _, b in ranges[:-1]] and ranges[0][0] == 0 and ranges[-1][1] == 1000
+        assert len(ranges) == (1 if expected == 0 else threads.TASKS_PER_THREAD * (expected + 1))
+
+
 def cores_of_helper(monkeypatch, run):
     """The core of the caller of `run`, given a function of a range, and the cores on which its helper may run."""
     from rts.compiling import threads

@@ -65,7 +65,7 @@ def test_compiled_it_is_the_array_code(target, given):
 def test_any_number_of_threads_merges_alike(given, count):
     alone = given_to(merging._interleaved_on_the_host, *given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threads, "LITTLE_WORK", 0)
+        patch.setattr(threads, "LITTLE_WORK", 1)
         patch.setenv("RTS_NUM_THREADS", str(count))
         for found, expected in zip(given_to(merging._interleaved_on_the_host, *given), alone, strict=True):
             np.testing.assert_array_equal(found, expected)

@@ -137,7 +137,7 @@ def test_lifting_some_cells_is_lifting_all_and_repacking(given):
 def test_any_number_of_threads_packs_alike(given, count):
     alone = pack_fragments(*given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threads, "LITTLE_WORK", 0)
+        patch.setattr(threads, "LITTLE_WORK", 1)
         patch.setenv("RTS_NUM_THREADS", str(count))
         assert_same(pack_fragments(*given), alone)
 
