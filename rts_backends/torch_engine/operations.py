@@ -51,13 +51,13 @@ _specifying = _Specifying()
 def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
     """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
 
-    They are on the host, or cross to it.
+    They are on the host, or cross to it; those of the device "meta" have no values.
     """
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
     for x in operands:
-        if not (x.is_cpu or operation.crosses) or (x.dtype != real and x.dtype not in _INTEGERS):
+        if not (x.is_cpu or (operation.crosses and not x.is_meta)) or (x.dtype != real and x.dtype not in _INTEGERS):
             return False
     return True
 
