@@ -157,7 +157,7 @@ def test_only_as_many_threads_are_asked_as_there_is_work_for(monkeypatch, helper
     asked = []
     monkeypatch.setattr(helpers, "ask", lambda job: asked.append(job))
     little = threads.LITTLE_WORK
-    for work, expected in ((little - 1, 0), (little, 1), (2 * little + 1, 2), (100 * little, 3), (None, 3)):
+    for work, expected in ((little - 1, 0), (little, 1), (2.0 * little + 1, 2), (100 * little, 3), (None, 3)):
         asked.clear()
         ranges = []
         threads.parallel(lambda start, stop, ranges=ranges: ranges.append((start, stop)), 1000, work=work)
