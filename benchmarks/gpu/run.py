@@ -147,18 +147,8 @@ def main() -> int:
             steps.run("packages", sys.executable, "-c", missing)
             steps.run("loops compiled", sys.executable, "-m", "rts", "warmup", share=0.3)
             if options.only != "tables":
-                tests = [
-                    sys.executable,
-                    "-m",
-                    "pytest",
-                    "-m",
-                    "devices",
-                    "-p",
-                    "no:cacheprovider",
-                    "-p",
-                    "no:benchmark",
-                ]
-                tests += ["--tb=short", "-q"]
+                tests = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-m", "devices"]
+                tests += ["-p", "no:cacheprovider", "-p", "no:benchmark"]
                 if importlib.util.find_spec("xdist"):
                     tests += ["-n", str(min(os.cpu_count() or 1, MOST_WORKERS))]
                 steps.run(

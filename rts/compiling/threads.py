@@ -222,6 +222,7 @@ def parallel(loop: Callable, count: int, *args: Any, work: int | None = None, of
     if little or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
         loop(0, count, *args)
         return
+    free = min(free, count - 1)
     if work is not None:
         free = min(free, int(work // LITTLE_WORK))  # To wake more would take longer than they save.
     tasks = min(count, (free + 1) * TASKS_PER_THREAD)

@@ -63,7 +63,7 @@ def push(
     if t_weights is None:
         return
     if affine and count == 3:
-        parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out)
+        parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out, work=8 * len(ids))
     else:
         parallel(_add_sum, len(ids), rows, ids, column, count, affine, t_weights, out, work=3 * count * len(ids))
 
@@ -91,7 +91,7 @@ def pull(
             _scatter_sum(ids, column, count, affine, weights, g, g_rows)
     if g_weights is not None:
         if affine and count == 3:
-            parallel(_weigh, len(ids), rows, ids, column, g, g_weights)
+            parallel(_weigh, len(ids), rows, ids, column, g, g_weights, work=8 * len(ids))
         else:
             parallel(_weigh_sum, len(ids), rows, ids, column, count, affine, g, g_weights, work=3 * count * len(ids))
 

@@ -112,7 +112,8 @@ class HostPrimitive:
                 item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
                 self._host(item, [x[b, ...] for x in results], **params)
 
-        parallel(items, len(results[0]), work=NUMBER * sum(x.size for x in results), off_caller_core=False)
+        numbers = sum(x.size for x in (*operands, *results))
+        parallel(items, len(results[0]), work=NUMBER * numbers, off_caller_core=False)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
         """The host call in a program for the CPU."""

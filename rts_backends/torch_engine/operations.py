@@ -51,13 +51,13 @@ _specifying = _Specifying()
 def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
     """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
 
-    They are on the host, or cross to it; those of the device "meta" have no values.
+    They are on the host, or cross to it from one device; those of the device "meta" have no values.
     """
-    real = operands[0].dtype
-    if real not in _DTYPES:
+    real, device = operands[0].dtype, operands[0].device
+    if real not in _DTYPES or not (device.type == "cpu" or (operation.crosses and device.type != "meta")):
         return False
     for x in operands:
-        if not (x.is_cpu or (operation.crosses and not x.is_meta)) or (x.dtype != real and x.dtype not in _INTEGERS):
+        if x.device != device or (x.dtype != real and x.dtype not in _INTEGERS):
             return False
     return True
 
@@ -65,7 +65,8 @@ def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
 class _Call:
     """A call of an operation, and the arrays that its value keeps for the derivatives.
 
-    The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has a
+    The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`; their copies on the host, of
+    an operation that crosses, are kept as long. Under `vmap` each item has a
     call of its own.
     """
 

@@ -164,6 +164,9 @@ def test_only_as_many_threads_are_asked_as_there_is_work_for(monkeypatch, helper
         assert len(asked) == expected
         assert [a for a, _ in ranges[1:]] == [b for _, b in ranges[:-1]] and ranges[0][0] == 0 and ranges[-1][1] == 1000
         assert len(ranges) == (1 if expected == 0 else threads.TASKS_PER_THREAD * (expected + 1))
+    asked.clear()
+    threads.parallel(lambda start, stop: None, 2)
+    assert len(asked) == 1  # The caller's thread has the other range.
 
 
 def cores_of_helper(monkeypatch, run):
