@@ -43,6 +43,8 @@ SETTINGS = [
     *(Setting(mesh, 512, sampler="opengl") for mesh in NAMES[1:]),
     *(Setting(mesh, 512, "full") for mesh in NAMES),
     *(Setting("bunny", side, engine="jax") for side in (512, 256)),
+    *(Setting("bunny", side, engine="jax, samples given") for side in (512, 256)),
+    Setting("bunny", 512, "full", engine="jax, samples given"),
 ]
 ON_CPU = SETTINGS[:8]
 """Those that are timed on the CPU, too."""
@@ -85,26 +87,67 @@ def jax_step(task: Task, mode: str, device: str, sampler: str = "raster") -> dic
     """An iteration with jax, one compiled program."""
     import jax
 
-    where = jax.devices(device)[0]
-    pose = jax.device_put(np.asarray(START, np.float32), where)
-    vertices = jax.device_put(task.vertices, where)
-    target = jax.device_put(task.target, where)
+    variables, others, target = _on_jax(task, mode, device)
 
     def loss(variables: dict) -> Any:
-        return task.loss(variables["pose"], variables.get("vertices", vertices), target, sampler)
+        known = others | variables
+        return task.loss(known["pose"], known["vertices"], target, sampler)
 
-    @jax.jit
-    def step(variables: dict) -> tuple:
-        value, gradient = jax.value_and_grad(loss)(variables)
-        return variables["pose"] - RATE * gradient["pose"], value, gradient
-
-    variables = {"pose": pose} | ({"vertices": vertices} if mode == "full" else {})
+    step = jax.jit(_step_of(loss))
 
     def iteration() -> None:
         variables["pose"], *rest = step(variables)
         jax.block_until_ready(rest)
 
     return {"iteration": iteration}
+
+
+def jax_stages(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
+    """The stages of an iteration with jax: samples, found outside of programs, and a compiled program of all others."""
+    import jax
+
+    variables, others, target = _on_jax(task, mode, device)
+    kept: dict[str, Any] = {}
+
+    def part(known: dict) -> rts.Part:
+        return task.part.replace(theta={"vertices": known["vertices"]}, transform=rts.rigid(known["pose"]))
+
+    def sample() -> None:
+        options: dict[str, Any] = {"sampler": sampler, "splatter": task.splatter, "layers": task.layers}
+        kept["sampled"] = rts.sample(part(others | variables), task.view, task.size, **options)
+
+    def loss(variables: dict, sampled: rts.Sampled) -> Any:
+        image = rts.render_samples(sampled, part(others | variables), task.view, splatter=task.splatter)
+        return task.reduction(image[..., task.channels] - target)
+
+    step = jax.jit(_step_of(loss))
+
+    def others_stages() -> None:
+        variables["pose"], *rest = step(variables, kept["sampled"])
+        jax.block_until_ready(rest)
+
+    return {"sample": sample, "shade, splat, backward, step": others_stages}
+
+
+def _on_jax(task: Task, mode: str, device: str) -> tuple[dict, dict, Any]:
+    """Variables of a task, all that a variable might be, and the target; arrays of jax on a device."""
+    import jax
+
+    where = jax.devices(device)[0]
+    pose = jax.device_put(np.asarray(START, np.float32), where)
+    known = {"pose": pose, "vertices": jax.device_put(task.vertices, where)}
+    return dict(known) if mode == "full" else {"pose": pose}, known, jax.device_put(task.target, where)
+
+
+def _step_of(loss: Callable) -> Callable:
+    """A step down the gradient in the pose: (variables, ·) → pose, loss, gradient."""
+    import jax
+
+    def step(variables: dict, *others: Any) -> tuple:
+        value, gradient = jax.value_and_grad(loss)(variables, *others)
+        return variables["pose"] - RATE * gradient["pose"], value, gradient
+
+    return step
 
 
 def timed(stages: dict[str, Callable[[], Any]], wait: Callable[[], None]) -> dict[str, float]:
@@ -164,8 +207,9 @@ def row(setting: Setting, device: str, folder: Path) -> dict[str, Any]:
     vertices, faces = kept_mesh(setting.mesh, folder)
     task = Task(setting.mesh, vertices, faces, setting.side, "lambert", 1)
     found: dict[str, Any] = {**setting._asdict(), "device": device, "faces": len(faces)}
-    if setting.engine == "jax":
-        return found | {"ms": timed(jax_step(task, setting.mode, device, setting.sampler), lambda: None)}
+    if setting.engine != "torch":
+        stages = (jax_step if setting.engine == "jax" else jax_stages)(task, setting.mode, device, setting.sampler)
+        return found | {"ms": timed(stages, lambda: None)}
     import torch
 
     stages = torch_step(task, setting.mode, device, setting.sampler)
