@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
-from rts.plugin_api.arrays import Array, Tree, exemplar, unit
+from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
+from rts.plugin_api.arrays import Array, Tree, exemplar
 from rts.plugin_api.checks import fingerprint, index_table, quoted
-from rts.plugin_api.operations import filled_up, interpolate, take, with_room
+from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
+from rts_surfaces.smooth_normals import smooth_normals, vertex_normals
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangents")
 
@@ -148,7 +149,7 @@ class Mesh(TriangleSurface):
         for name in self._attributes(theta):
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
-            gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(vertices), samples, 0))
+            gbuffer.defer("normal", partial(self._smooth_normals, vertices, samples))
         return gbuffer
 
     def attribute(self, name: str, rows: Array, samples: Samples) -> Array:
@@ -158,24 +159,20 @@ class Mesh(TriangleSurface):
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
         return interpolate(rows, samples.ids, column, samples.params)
 
+    def _smooth_normals(self, vertices: Array, samples: Samples) -> Array:
+        """Normals (N, 3) at samples where θ has none."""
+        if exemplar(vertices) is None:
+            return self._interpolate(self.vertex_normals(vertices), samples, 0)
+        return smooth_normals(vertices, samples.params, samples.ids, self.faces)
+
     def vertex_normals(self, vertices: Array) -> Array:
         """Unit normals (V, 3): directions of the area-weighted sums over the faces around each vertex, or zero.
 
         Those of NumPy vertices are kept until the vertices change.
         """
         if exemplar(vertices) is not None:
-            return self._vertex_normals(vertices)
+            return vertex_normals(vertices, engine_of(vertices).constant(self.faces, vertices))
         key, kept = fingerprint(vertices), self._normals
         if kept is None or kept[0] != key:
-            kept = self._normals = (key, self._vertex_normals(vertices))
+            kept = self._normals = (key, vertex_normals(vertices, self.faces))
         return kept[1]
-
-    def _vertex_normals(self, vertices: Array) -> Array:
-        xp, engine = namespace(vertices), engine_of(vertices)
-        # Further faces are points, and add nothing.
-        table = filled_up(self.faces, engine.room(len(self.faces), vertices))
-        faces = engine.constant(table, vertices)
-        a, b, c = (take(vertices, faces[:, i]) for i in range(3))
-        face_normals = xp.linalg.cross(b - a, c - a)
-        segments = xp.reshape(faces.T, (-1,))
-        return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))

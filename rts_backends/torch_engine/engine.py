@@ -32,6 +32,8 @@ _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, tor
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
 
+_CPU = torch.device("cpu")
+
 _sent: dict[tuple[int, torch.device], tuple[weakref.ref, torch.Tensor]] = {}
 """Read-only tables of the host by identity and device, and their tensors there."""
 
@@ -54,8 +56,8 @@ class TorchEngine(Engine):
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
         """`value` on the device of `like`, else on the CPU; floats as float64 if `like` is, else as float32.
 
-        Read-only tables of integers, such as a mesh's faces, are sent to a device once, and kept as long as they live:
-        their numbers must stay, and nobody may change the result in place.
+        Of read-only tables of integers, such as a mesh's faces, one tensor is made for each device, and kept as long as
+        they live: their numbers must stay, and nobody may change the result in place.
         """
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
@@ -63,8 +65,8 @@ class TorchEngine(Engine):
             # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
                 array = array.astype(dtype)
-        device = None if like is None else like.device
-        if device is None or device.type == "cpu" or array.dtype.kind != "i" or not _is_fixed(array) or transformed():
+        device = _CPU if like is None else like.device
+        if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)
         key = id(array), device
         kept = _sent.get(key)

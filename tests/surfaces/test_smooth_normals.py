@@ -1,0 +1,84 @@
+"""Smooth normals of a mesh at samples: an operation, whose loops compute what samples name and no more."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, arrays, gradient, icosphere, to_numpy
+
+from rts import InputError
+from rts.compiling.threads import read_only
+from rts.testing import OperationConformance
+from rts_surfaces.smooth_normals import SMOOTH_NORMALS, smooth_normals, vertex_normals
+
+pytestmark = pytest.mark.sampling
+
+RNG = np.random.default_rng(0)
+BALL, FACES = icosphere(2)
+
+
+def some_samples(count=40, faces=FACES):
+    """Params and ids of samples on a few triangles, so that most vertices have none."""
+    params = RNG.dirichlet((1, 1, 1), count)[:, :2]
+    return params, faces[RNG.integers(0, len(faces) // 8, count)]
+
+
+class TestSmoothNormals(OperationConformance):
+    @pytest.fixture
+    def operation(self):
+        return SMOOTH_NORMALS
+
+    @pytest.fixture
+    def operands(self):
+        return (BALL * RNG.uniform(0.8, 1.2, BALL.shape), *some_samples(), FACES)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_on_a_ball_they_are_the_radii_however_small_or_large_it_is(target):
+    params, ids = some_samples()
+    weights = np.column_stack([params, 1 - params.sum(1)])[:, :, None]
+    for size in (1e-15, 1.0, 1e15):
+        given = arrays(target, [(size * BALL).astype(np.float32), params, ids])
+        np.testing.assert_allclose(to_numpy(smooth_normals(*given, FACES)), (weights * BALL[ids]).sum(1), atol=0.02)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_sheet_that_turns_takes_its_normals_along(target):
+    # z = a x has the normal (−a, 0, 1) / √(1 + a²), whose derivative at a = 0 is (−1, 0, 0).
+    x, y = (t.reshape(-1) for t in np.meshgrid(np.arange(4.0), np.arange(4.0)))
+    first = np.array([i + 4 * j for j in range(3) for i in range(3)])
+    faces = np.concatenate([np.stack([first, first + 1, first + 4], 1), np.stack([first + 1, first + 5, first + 4], 1)])
+    params, ids = some_samples(9, faces.astype(np.int32))
+    given = arrays(target, [np.stack([x, y, 0 * x], 1), np.stack([0 * x, 0 * x, x], 1), params, ids])
+
+    def along_x(slope):
+        vertices, way, *samples = given
+        return smooth_normals(vertices + slope * way, *samples, faces.astype(np.int32))[:, 0].sum()
+
+    np.testing.assert_allclose(gradient(target, along_x, arrays(target, np.array(0.0))), -9, rtol=1e-6)
+
+
+def test_vertices_without_area_have_none_and_its_derivative_is_that_of_the_sum():
+    vertices, params, ids = np.zeros((3, 3)), np.array([(0.2, 0.3)]), np.array([(0, 1, 2)], np.int32)
+    operands = [read_only(x) for x in (vertices, params, ids, ids)]
+    found, kept = SMOOTH_NORMALS.value_on_host(operands, {})
+    np.testing.assert_array_equal(found, 0)
+    pulled = np.zeros_like(vertices)
+    SMOOTH_NORMALS.pull_on_host(operands, np.ones((1, 3)), (pulled, None), kept, {})
+    assert np.isfinite(pulled).all()
+
+
+def test_vertices_that_no_sample_names_have_no_row():
+    params, ids = some_samples()
+    kept = SMOOTH_NORMALS.value_on_host([read_only(x) for x in (BALL, params.astype(BALL.dtype), ids, FACES)], {})[1]
+    named = np.unique(ids)
+    np.testing.assert_array_equal(np.flatnonzero(kept.row_of), named)
+    assert kept.unit.shape == (len(named), 3) and len(named) < len(BALL) / 2
+    np.testing.assert_allclose(kept.unit[kept.row_of[named] - 1], vertex_normals(BALL, FACES)[named], atol=1e-5)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_what_names_no_vertex_is_refused(target):
+    params, ids = some_samples()
+    for vertices, named, faces in ((BALL, ids - 9, FACES), (BALL, ids + len(BALL), FACES), (BALL, ids, FACES + 500)):
+        given = arrays(target, [vertices, params.astype(vertices.dtype), named])
+        with pytest.raises(InputError, match=f"not among {len(BALL)}; sample the mesh anew"):
+            to_numpy(smooth_normals(*given, faces))
