@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, quoted
-from rts.arrays.array_functions import dot, from_numbers, promote, shape_of, unit
+from rts.arrays.array_functions import dot, from_numbers, promote, shape_of
 from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checked_parts import check_parts, listed_parts
 from rts.contracts.checks import check_size
 from rts.errors import InputError
 from rts.operations.take import take
+from rts.operations.unit import unit
 from rts.rendering.arguments import Layers, SamplerLike
 from rts.rendering.samples import sample
 from rts.rendering.splats import to_splats

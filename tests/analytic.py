@@ -1,8 +1,8 @@
 """A surface that intersects rays itself: an axis-aligned ellipsoid."""
 
 from rts import GBuffer, RaySurface
-from rts.arrays.array_functions import unit
 from rts.arrays.engines import namespace
+from rts.operations.unit import unit
 from rts.plugin_api.records import RayHits
 
 

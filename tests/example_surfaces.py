@@ -5,7 +5,8 @@ import pytest
 from analytic import Ellipsoid
 
 import rts
-from rts.arrays.array_functions import described, unit
+from rts.arrays.array_functions import described
+from rts.operations.unit import unit
 from rts.plugin_api.operations import combine
 from rts.plugin_api.records import ArraySpec, Proxy, RayHits
 

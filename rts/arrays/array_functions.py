@@ -149,27 +149,6 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
     return namespace(*arrays), arrays
 
 
-def unit(x: Array) -> Array:
-    """Vectors scaled to length one; a zero vector stays zero, and has the identity for derivative."""
-    xp = namespace(x)
-    with np.errstate(over="ignore"):  # NumPy warns of squares that are too large.
-        square = dot(x, x)
-    if not _is_moderate(square):
-        # Float32 holds no square of a length below 1e-19 or above 1e19, so the largest component becomes 1 before.
-        size = xp.max(abs(engine_of(x).stop_gradient(x)), axis=-1, keepdims=True)
-        x = x / xp.where(size > 0, size, xp.ones_like(size))
-        square = dot(x, x)
-    safe = xp.where(square > 0, square, xp.ones_like(square))
-    return x / xp.sqrt(safe)
-
-
-def _is_moderate(square: Array) -> bool:
-    """True if squares are known, on the host, and far from the ends of float32; zeros are not, and may be underflow."""
-    engine = engine_of(square)
-    values = engine.known(square) if engine.on_host(square) else None
-    return values is not None and bool(values.min(initial=1.0) > 1e-24 and values.max(initial=1.0) < 1e24)
-
-
 def dot(a: Array, b: Array) -> Array:
     """Scalar products (…, 1) of short vectors (…, C)."""
     engine, products = engine_of(a, b), a * b

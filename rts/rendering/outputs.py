@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import shape_of, unit
+from rts.arrays.array_functions import shape_of
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
@@ -16,6 +16,7 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.shader import Shader
 from rts.errors import InputError
+from rts.operations.unit import unit
 from rts.plugin_base import promised
 from rts.rendering.settings import RenderSettings
 from rts.sampling.scene import Scene

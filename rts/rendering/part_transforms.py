@@ -29,13 +29,12 @@ class OneTransform(NamedTuple):
 
     def normals(self, normals: Array) -> Array:
         """Normals (N, 3), of any length, moved: times the cofactor matrix; a mirror keeps them outward."""
-        columns, _ = _cofactors(*_columns(self.matrix))
-        return sum(normals[:, i : i + 1] * columns[i] for i in range(3))
+        return affine_map(_linear(_cofactors(*_columns(self.matrix))[0]), normals)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), of any length, moved; a mirror changes the signs."""
         columns = _columns(self.matrix)
-        moved = sum(tangents[:, i : i + 1] * columns[i] for i in range(3))
+        moved = affine_map(_linear(columns), tangents[:, :3])
         return namespace(moved).concat([moved, tangents[:, 3:] * _cofactors(*columns)[1]], axis=1)
 
 
@@ -74,8 +73,13 @@ class ViewTransforms(NamedTuple):
 
     def _turned(self, columns: Sequence[Array], vectors: Array) -> Array:
         """Vectors (N, 3) times the matrices with three columns (B, 3)."""
-        none = namespace(self.matrices).zeros_like(columns[0])
-        return affine_map_of_views(namespace(none).stack([*columns, none], axis=-1), vectors, self.view)
+        return affine_map_of_views(_linear(columns), vectors, self.view)
+
+
+def _linear(columns: Sequence[Array]) -> Array:
+    """Linear maps as affine ones (..., 3, 4), from three columns (..., 3)."""
+    xp = namespace(columns[0])
+    return xp.stack([*columns, xp.zeros_like(columns[0])], axis=-1)
 
 
 def _columns(matrix: Array) -> list[Array]:

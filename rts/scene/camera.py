@@ -19,12 +19,13 @@ from typing import Any, Literal
 import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, check_pixels, is_invertible, quoted
-from rts.arrays.array_functions import described, from_numbers, promote, shape_of, unit
+from rts.arrays.array_functions import described, from_numbers, promote, shape_of
 from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves, record
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
+from rts.operations.unit import unit
 from rts.scene.camera_converters import CameraConverters
 from rts.scene.rays import Rays
 from rts.scene.transforms import (

@@ -16,11 +16,12 @@ from rts.arrays.argument_checks import (
     check_rotation,
     is_invertible,
 )
-from rts.arrays.array_functions import promote, unit
+from rts.arrays.array_functions import promote
 from rts.arrays.engines import is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.linear import matmul
+from rts.operations.unit import unit
 from rts.scene.transforms import (
     ROUNDING,
     affine_matrix,

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, check_planes, check_positive, quoted
-from rts.arrays.array_functions import promote, unit
+from rts.arrays.array_functions import promote
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
 from rts.errors import InputError, InputWarning, warn
 from rts.operations.linear import matmul
+from rts.operations.unit import unit
 
 
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:

@@ -27,10 +27,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import dot, shape_of, unit
+from rts.arrays.array_functions import dot, shape_of
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array, Tree
 from rts.errors import InputError
+from rts.operations.unit import unit
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.environment import blurs, prefiltered, reflected

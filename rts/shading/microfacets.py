@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.array_functions import dot, unit
+from rts.arrays.array_functions import dot
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
+from rts.operations.unit import unit
 from rts.shading.environment import blur
 from rts.shading.spherical_harmonics import DIFFUSE, harmonics
 

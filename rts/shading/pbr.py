@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays.array_functions import described, dot, shape_of, unit
+from rts.arrays.array_functions import described, dot, shape_of
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.gbuffer import GBuffer
 from rts.errors import InputError
+from rts.operations.unit import unit
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading import microfacets

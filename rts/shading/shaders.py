@@ -20,12 +20,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import dot, shape_of, unit
+from rts.arrays.array_functions import dot, shape_of
 from rts.arrays.engines import engine_of, is_constant, namespace, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
+from rts.operations.unit import unit
 from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras

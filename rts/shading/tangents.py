@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from rts.arrays.array_functions import dot, unit
+from rts.arrays.array_functions import dot
 from rts.arrays.engines import Context, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
+from rts.operations.unit import unit
 from rts.shading.parameter_steps import check_two_parameters, steps_beside
 
 TANGENT = "tangent"

@@ -12,6 +12,7 @@ from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import TAKE, take
+from rts.operations.unit import UNIT, unit
 from rts.plugin_api.operations import Operation
 from rts.scene.rigid import RIGID
 from rts.testing import OperationConformance
@@ -286,6 +287,7 @@ def cases():
         "affine_of_views": (linear.VIEWS, [rng.normal(size=(3, 2, 4)), points, view], {}),
         "projection": (projection.PROJECTION, [ahead[0], points], {}),
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
+        "unit": (UNIT, [points], {}),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 
@@ -312,6 +314,20 @@ class TestEachOperation(OperationConformance):
 
 
 # ------------------------------------------------------------------------------------- gradients of functions of points
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_unit_vectors_of_any_length_and_the_derivative_of_zero(dtype):
+    direction = np.array([0.6, 0, 0.8])
+    sizes = {np.float32: (1e-40, 1e-30, 1.0, 1e30), np.float64: (1e-300, 1e-150, 1.0, 1e150, 1e300)}[dtype]
+    vectors = np.array([size * direction for size in sizes]).astype(dtype)
+    rtol = 1e-4 if dtype is np.float32 else 1e-12  # Of the least float32 numbers few digits are left.
+    np.testing.assert_allclose(unit(vectors), np.tile(direction, (len(sizes), 1)), rtol=rtol)
+    zero, g, found = np.zeros((1, 3), dtype), np.array([(1.0, 2.0, 3.0)], dtype), np.full((1, 3), np.nan, dtype)
+    np.testing.assert_array_equal(unit(zero), zero)
+    UNIT.pull_on_host([zero], g, [found], None, {})
+    np.testing.assert_array_equal(found, g)
+    assert np.isnan(unit(np.array([(np.nan, 1, 1)], dtype))).all()
 
 
 @pytest.mark.parametrize("target", ALL)

@@ -5,7 +5,7 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, icosphere, quick, relative_error, to_numpy
 
 import rts
-from rts.arrays.array_functions import unit
+from rts.operations.unit import unit
 
 pytestmark = pytest.mark.rendering
 

@@ -7,8 +7,8 @@ from networks import FIELD, network
 
 import rts
 from rts import Camera, InputError, Ndc
-from rts.arrays.array_functions import unit
 from rts.arrays.trees import map_leaves, placed_leaves
+from rts.operations.unit import unit
 from rts.testing import ShaderConformance, SurfaceConformance
 from rts_surfaces.radiance_field import lattice as lattices
 from rts_surfaces.radiance_field.chunks import in_chunks
