@@ -244,7 +244,7 @@ def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_th
     loaded = modules_after("import rts\nassert not rts.registry._entry_points\nassert not hasattr(rts, 'regulrizers')")
     assert not {m for m in loaded if m.startswith("rts_surfaces")}
     loaded = modules_after("import rts\nassert rts.registry._entry_points == {}\nrts.Mesh")
-    expected = {"rts_surfaces.parameter_checks", "rts_surfaces.mesh"}
+    expected = {"rts_surfaces.parameter_checks", "rts_surfaces.mesh", "rts_surfaces.smooth_normals"}
     assert {m for m in loaded if m.startswith("rts_surfaces.")} == expected
 
 
@@ -264,6 +264,7 @@ def test_only_the_plugin_asked_for_is_imported():
         "rts_backends.reference",
         "rts_surfaces.parameter_checks",
         "rts_surfaces.mesh",
+        "rts_surfaces.smooth_normals",
     }
     assert not loaded & set(HEAVY)
 
