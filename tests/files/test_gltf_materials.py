@@ -316,6 +316,15 @@ def test_what_samplers_and_sides_make_of_a_test_card(data):
     assert shown.std() > 0.2 and np.abs(tested - shown).mean() < 0.025
 
 
+def test_colours_of_a_box_are_at_its_corners_times_the_factor(data):
+    [part] = rts.load(data / "gltf/BoxVertexColors.glb")
+    camera = rts.Camera.orthographic((0, 0, 5), (0, 0, 0), height=1)
+    image = rts.render(part.replace(shader="unlit"), camera, (400, 400))
+    # Upper left and right, lower left and right, of the side towards the camera; sampled half a pixel inside.
+    corners = [(0.511, 1, 0), (1, 0.001, 0.025), (0.804, 0.804, 0.804), (0.003, 0.131, 0.999)]
+    np.testing.assert_allclose(image[::399, ::399, :3].reshape(4, 3), 0.8 * np.array(corners), atol=0.005)
+
+
 @pytest.mark.thorough
 def test_tangents_that_are_computed_are_those_of_a_file(data):
     [part] = rts.load(data / "gltf/WaterBottle/WaterBottle.gltf")

@@ -100,3 +100,25 @@ def test_surfaces_of_other_parameters_have_no_tangents():
     wrong = samples.replace(params=np.zeros((len(samples.ids), 3)))
     with pytest.raises(rts.InputError, match="expected two: without them 'tangent'"):
         tangents(rts.Mesh(quad()[1]), {}, wrong, {}, None)
+
+
+@pytest.mark.parametrize("direction", [(-1, 1, 1), (1, 1, 1), (1, -1, 1)])
+def test_a_file_s_normal_maps_look_like_the_domes_that_they_were_baked_from(data, direction):
+    # Ten squares of dielectrics hold a dome, and those beside them its normal map, each turned another way.
+    [part] = rts.load(data / "gltf/NormalTangentTest.glb")
+    theta = {**part.theta, "light": {"direction": np.array(direction, float), "ambient": 0.1}}
+    camera = Camera.orthographic((0, -0.125, 1), (0, -0.125, 0), height=2.15, aspect=444 / 430)
+    y, x = np.mgrid[-17:18, -17:18]
+
+    def off(normal_map):
+        """The difference of a dome and its map, relative to the dome, for each of ten."""
+        image = show(part.replace(theta={**theta, "normal_map": normal_map}), camera, size=(430, 444))
+        shown, disk = np.clip(image[..., :3], 0, 1), x**2 + y**2 < 17**2  # Highlights are clipped as a display does.
+        found = []
+        for cy, cx in ((30 + 80 * row, 30 + 160 * column) for row in range(5) for column in range(2)):
+            dome, mapped = (shown[cy + y, cx + step + x][disk] for step in (0, 64))
+            found.append(np.sqrt(((dome - mapped) ** 2).mean() / (dome**2).mean()))
+        return found
+
+    assert max(off(theta["normal_map"])) < 0.02
+    assert min(off(theta["normal_map"] * np.float32([1, -1, 1]))) > 0.1
