@@ -23,7 +23,11 @@ from benchmarks.report import table
 DATA = Path(os.environ.get("RTS_DATA", "../shared/data"))
 COLUMNS = (0.2, 0.4, 0.6, 0.8, 1.0)
 """Roughnesses."""
-MODELS = {"WaterBottle": "gltf/WaterBottle/WaterBottle.gltf", "DamagedHelmet": "gltf/DamagedHelmet.glb"}
+MODELS = {
+    "WaterBottle": "gltf/WaterBottle/WaterBottle.gltf",
+    "DamagedHelmet": "gltf/DamagedHelmet.glb",
+    "NormalTangentTest": "gltf/NormalTangentTest.glb",
+}
 EYE = (1.2, 0.5, 2.6)
 
 

@@ -51,7 +51,7 @@ def specified_affine_map(rows: Array, points: Array) -> Array:
     engine = engine_of(rows, points)
     if engine.exact_products(rows, points):
         return points @ rows[:, :3].T + rows[:, 3]
-    return engine.namespace.stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
+    return points[:, :1] * rows[:, 0] + points[:, 1:2] * rows[:, 1] + points[:, 2:] * rows[:, 2] + rows[:, 3]
 
 
 def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
