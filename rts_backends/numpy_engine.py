@@ -39,9 +39,14 @@ class NumpyEngine(Engine):
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """The operation's result: by compiled code if `operation.fits` the dtypes, else by its array code."""
+        """The operation's result: by compiled code if `operation.fits` the dtypes, else by its array code.
+
+        Beside float64, float32 is widened, as NumPy does.
+        """
         if not operation.fits(list(map(_DTYPE, operands))):
-            return operation.specification(*operands, **params)
+            operands = [x.astype(np.float64) if x.dtype == np.float32 else x for x in operands]
+            if not operation.fits(list(map(_DTYPE, operands))):
+                return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 
     def on_host(self, *arrays: np.ndarray) -> bool:

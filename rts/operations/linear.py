@@ -13,7 +13,7 @@ import numpy as np
 from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.operations.by_view import index_of_views, operation_of_views, ranges_of_views
+from rts.operations.by_view import index_of_views, operation_of_views
 from rts.operations.operation import Operation
 
 
@@ -34,16 +34,7 @@ def affine(row: Array, points: Array) -> Array:
 
 def affine_map(rows: Array, points: Array) -> Array:
     """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
-    if is_plain_product(rows, points):
-        AFFINE.check_ranks((rows, points))
-        return specified_affine_map(rows, points)
     return AFFINE(rows, points)
-
-
-def is_plain_product(*arrays: Array) -> bool:
-    """True if a plain matrix product will do: it keeps the precision, and the engine has no derivatives."""
-    engine = engine_of(*arrays)
-    return not engine.differentiates and engine.exact_products(*arrays)
 
 
 def specified_affine_map(rows: Array, points: Array) -> Array:
@@ -84,14 +75,7 @@ def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
         points: (N, 3), views one after the other.
         view: (N,) int32, the view of each point; see `rts.operations.by_view`.
     """
-    if not is_plain_product(rows, points):
-        return VIEWS(rows, points, view)
-    VIEWS.check_ranks((rows, points, view))
-    mapped = np.zeros((len(points), rows.shape[1]), np.result_type(rows, points))
-    for b, of_view in ranges_of_views(view, len(rows)):
-        np.matmul(points[of_view], rows[b, :, :3].T, out=mapped[of_view])
-        mapped[of_view] += rows[b, :, 3]
-    return mapped
+    return VIEWS(rows, points, view)
 
 
 def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:

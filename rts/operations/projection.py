@@ -9,8 +9,8 @@ import numpy as np
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.operations.by_view import index_of_views, operation_of_views, ranges_of_views
-from rts.operations.linear import is_plain_product, specified_affine_map
+from rts.operations.by_view import index_of_views, operation_of_views
+from rts.operations.linear import specified_affine_map
 from rts.operations.operation import Operation
 
 
@@ -19,16 +19,13 @@ def projective_map(rows: Array, points: Array) -> Array:
 
     A point whose third value is zero has no image; its result is finite.
     """
-    if is_plain_product(rows, points):
-        PROJECTION.check_ranks((rows, points))
-        return _specification(rows, points)
     return PROJECTION(rows, points)
 
 
 def projective_map_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
     """`projective_map` for points (N, 3) of several views, which are placed side by side in one picture.
 
-    Unused rows at the end hold anything; NumPy's plain products leave these rows out.
+    Unused rows at the end hold anything.
 
     Args:
         rows: (B, 4, 4), the affine maps of each view.
@@ -36,13 +33,7 @@ def projective_map_of_views(rows: Array, points: Array, view: Array, places: Arr
         view: (N,) int32, the view of each point; see `rts.operations.by_view`.
         places: (B, 2), for each view the offsets of x and y.
     """
-    if not is_plain_product(rows[0, ...], points):
-        return VIEWS(rows, points, view, places)
-    xp, placed = namespace(points), []
-    for b, of_view in ranges_of_views(view, len(rows)):
-        projected = _specification(rows[b, ...], points[of_view, :])
-        placed.append(xp.concat([projected[:, :2] + places[b, ...], projected[:, 2:]], axis=1))
-    return xp.concat(placed)
+    return VIEWS(rows, points, view, places)
 
 
 def _specification(rows: Array, points: Array) -> Array:

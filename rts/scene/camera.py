@@ -23,7 +23,7 @@ from rts.arrays.array_functions import described, from_numbers, promote, shape_o
 from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves, record
 from rts.errors import InputError
-from rts.operations.linear import affine, matmul, specified_affine_map
+from rts.operations.linear import affine, affine_map, matmul
 from rts.operations.projection import projective_map
 from rts.operations.unit import unit
 from rts.scene.camera_converters import CameraConverters
@@ -334,7 +334,7 @@ class Camera(CameraConverters):
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""
-        return specified_affine_map(toward_rows(self.view, self.projection), points)
+        return affine_map(toward_rows(self.view, self.projection), points)
 
     def depth(self, points: Array) -> Array:
         """(N,) linear depth of world points (N, 3)."""

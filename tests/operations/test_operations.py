@@ -255,6 +255,13 @@ def test_other_dtypes_are_left_to_its_specification(calls):
     assert not calls
 
 
+def test_floats_of_two_widths_are_widened_by_numpy_and_need_no_specification(calls):
+    x, scale = operands()
+    found = CLAMP(x.astype(np.float32), scale.astype(np.float64), power=2)
+    assert found.dtype == np.float64 and len(calls) == 1
+    np.testing.assert_allclose(found, CLAMP(x, scale, power=2), rtol=1e-6)
+
+
 def test_operations_of_one_name_do_not_take_each_other_s_place():
     jax = pytest.importorskip("jax")
 
