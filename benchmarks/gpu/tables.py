@@ -116,7 +116,7 @@ def jax_stages(task: Task, mode: str, device: str, sampler: str = "raster") -> d
         options: dict[str, Any] = {"sampler": sampler, "splatter": task.splatter, "layers": task.layers}
         kept["sampled"] = rts.sample(part(others | variables), task.view, task.size, **options)
 
-    def loss(variables: dict, sampled: rts.Sampled) -> Any:
+    def loss(variables: dict, sampled: Any) -> Any:
         image = rts.render_samples(sampled, part(others | variables), task.view, splatter=task.splatter)
         return task.reduction(image[..., task.channels] - target)
 

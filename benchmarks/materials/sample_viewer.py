@@ -56,7 +56,7 @@ def ours(one: Picture) -> np.ndarray:
     center, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     away = np.array(one.toward) / np.linalg.norm(one.toward) * one.distance * radius
     camera = rts.Camera.look_at(center + away, center, fov_y=45, aspect=one.size[0] / one.size[1])
-    image = rts.render(parts, camera, one.size[::-1], background=np.full(3, 0.04), supersample=2)
+    image = rts.render(parts, camera, (one.size[1], one.size[0]), background=np.full(3, 0.04), supersample=2)
     return np.asarray(tonemap(image[..., :3]))
 
 

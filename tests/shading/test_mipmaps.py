@@ -265,6 +265,21 @@ def test_transparent_texels_count_by_their_alpha(target):
     np.testing.assert_allclose(found, 0.5, atol=1e-5)
 
 
+def test_what_a_texture_cuts_out_has_smooth_edges():
+    y, x = (np.mgrid[:512, :512] + 0.5) / 512 - 0.5
+    disk = np.stack([np.ones((512, 512))] * 3 + [x**2 + y**2 < 0.3**2], axis=-1).astype(np.float32)
+
+    def alpha(supersample=1, **options):
+        shader = rts.plugin("shaders", "unlit")(opaque=False, **options)
+        part = mesh_part(quad(), shader=shader, theta={"texture": disk, "uv": CORNERS})
+        return show(part, EYE, size=(40, 48), supersample=supersample)[..., 3]
+
+    true = alpha(16)
+    edge = (true > 0.02) & (true < 0.98)
+    plain, smooth = (np.sqrt(np.mean((found - true)[edge] ** 2)) for found in (alpha(), alpha(mip=True)))
+    assert plain > 0.2 and smooth < 0.06, (plain, smooth)
+
+
 def test_a_checker_floor_is_nearer_to_its_average():
     checker = (np.indices((32, 32)).sum(axis=0) % 2)[..., None] * np.ones(3, np.float32)
     size = (40, 48)
