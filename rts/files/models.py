@@ -47,7 +47,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
     as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
-    that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
+    that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent. Heights
+    of `map_Bump` become "normal_map", and so does a picture there that has the colours of a normal map.
 
     Parts of a glTF are at rest: joints, morph targets and clips are left out, and `rts.load_model` reads them.
 

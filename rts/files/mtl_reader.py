@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.errors import InputError
+from rts.files.bump_maps import holds_normals, normals_of_heights
 from rts.files.damaged_files import contents, lines_of
 from rts.files.images import read_texture
 from rts.files.paths import inside
@@ -28,8 +29,16 @@ _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 NUMBERS = {"pm": "metallic", "pr": "roughness", "ke": "emissive"}
 """Statements of numbers that the shader `pbr` reads → entries of θ."""
-MAPS = {"map_pm": "metallic", "map_pr": "roughness", "map_ke": "emissive", "norm": "normal_map"}
-"""Statements of maps that it reads."""
+MAPS = {
+    "map_pm": "metallic",
+    "map_pr": "roughness",
+    "map_ke": "emissive",
+    "norm": "normal_map",
+    "map_bump": "bump",
+}
+"""Statements of maps that it reads, or, of "bump", of which its normal map is made."""
+STEEPEST = 1e6
+"""The largest multiplier of heights."""
 
 
 class Material(NamedTuple):
@@ -42,7 +51,8 @@ class Material(NamedTuple):
         texture: file of map_Kd, or None. It replaces Kd.
         numbers: "metallic" () of Pm and "roughness" () of Pr, both in [0, 1], and "emissive" (3,) of Ke, sRGB and not
             black, as far as the material has them.
-        maps: files of "metallic", "roughness", "emissive" and "normal_map". They replace numbers.
+        maps: files of "metallic", "roughness", "emissive", and "normal_map" or else "bump". They replace numbers.
+        multiplier: the option -bm of "bump", by which its slopes are multiplied.
         unread: statements of other maps.
         options: options of maps that are read, which are not followed: "-s of map_kd", for instance.
     """
@@ -51,16 +61,20 @@ class Material(NamedTuple):
     texture: Path | None = None
     numbers: Mapping[str, np.ndarray] = MappingProxyType({})
     maps: Mapping[str, Path] = MappingProxyType({})
+    multiplier: float = 1.0
     unread: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
 
-    def entries(self, referrer: Path) -> dict[str, np.ndarray] | None:
-        """Entries of θ for the shader `pbr`, linear; None if the material has none. `referrer` is for errors.
+    def entries(self, referrer: Path) -> tuple[dict[str, np.ndarray] | None, bool]:
+        """Entries of θ for the shader `pbr`, linear, None if the material has none; `referrer` is for errors.
+
+        With it, True where map_Bump has the colours of a normal map, and is taken for one.
 
         Raises:
             InputError: a map is missing or cannot be read.
         """
         entries = {name: decode_srgb(x) if name == "emissive" else x for name, x in self.numbers.items()}
+        mistaken = False
         for name, file in self.maps.items():
             pixels = read_texture(file, referrer)[..., :3]
             match name:
@@ -68,9 +82,14 @@ class Material(NamedTuple):
                     entries[name] = decode_srgb(pixels)
                 case "normal_map":
                     entries[name] = 2 * pixels - 1
+                case "bump" if holds_normals(pixels):
+                    scale = np.array([self.multiplier, self.multiplier, 1], np.float32)  # As the scale of a glTF.
+                    entries["normal_map"], mistaken = (2 * pixels - 1) * scale, True
+                case "bump":
+                    entries["normal_map"] = normals_of_heights(pixels, self.multiplier)
                 case _:
                     entries[name] = np.ascontiguousarray(pixels[..., :1])
-        return entries or None
+        return entries or None, mistaken
 
 
 def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
@@ -85,7 +104,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     of_meshlab = any(_MESHLAB.match(line) for line in lines)
     for number, line in enumerate(lines, start=1):
         key, _, rest = line.replace("\t", " ").strip().partition(" ")
-        key, rest = key.lower(), rest.strip()
+        key, rest = {"bump": "map_bump"}.get(key.lower(), key.lower()), rest.strip()
         values = _numbers(library, number, rest) if key in ("kd", "d", "tr", *NUMBERS) else []
         if key == "newmtl":
             current = materials.setdefault(rest, {})
@@ -97,8 +116,10 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
             current.setdefault("alpha", values[0] if of_meshlab or values[0] >= 1 else 1 - values[0])
         elif key.startswith(_MAPS) and rest:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
+            if key == "map_bump":
+                current["multiplier"] = _multiplier(library, number, rest)
             if key == "map_kd" or key in MAPS:
-                current.setdefault("options", {})[key] = _unfollowed(rest)
+                current.setdefault("options", {})[key] = _unfollowed(key, rest)
             if key == "map_kd":
                 current["texture"] = file
             elif key in MAPS:
@@ -111,19 +132,39 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     return {name: _material(values) for name, values in materials.items()}
 
 
-def _unfollowed(rest: str) -> list[str]:
-    """The options of a map statement, in small letters, but for those that change nothing."""
-    options = _MAP_OPTIONS.match(rest)
+def _unfollowed(key: str, rest: str) -> list[str]:
+    """The options of a map statement that are not followed, in small letters, but for those that change nothing."""
     found = []
-    for name, values in _OPTION.findall(options.group() if options else ""):
-        name, words = name.lower(), values.lower().split()
+    for name, words in _options(rest):
         try:
             usual = {float(word) for word in words} <= _USUAL.get(name, set())
         except ValueError:
             usual = words == [_SWITCHES.get(name)]
-        if not usual:
+        if not usual and (key, name) != ("map_bump", "-bm"):
             found.append(name)
     return found
+
+
+def _options(rest: str) -> list[tuple[str, list[str]]]:
+    """The options of a map statement and their values, in small letters."""
+    options = _MAP_OPTIONS.match(rest.lower())
+    return [(name, values.split()) for name, values in _OPTION.findall(options.group() if options else "")]
+
+
+def _multiplier(library: Path, number: int, rest: str) -> float:
+    """The number of the option -bm in a map statement, 1 without one; refused where it is none, or too large."""
+    multiplier = 1.0
+    for words in (words for name, words in _options(rest) if name == "-bm"):
+        try:
+            [multiplier] = map(float, words)
+        except ValueError:
+            multiplier = np.inf
+        if not abs(multiplier) <= STEEPEST:
+            raise InputError(
+                f"{library}, line {number}: -bm is {' '.join(words)[:60]!r} in {rest[:60]!r}; expected one number "
+                f"from {-STEEPEST:g} to {STEEPEST:g}"
+            )
+    return multiplier
 
 
 def _numbers(library: Path, number: int, text: str) -> list[float]:
@@ -147,6 +188,11 @@ def _material(values: dict[str, Any]) -> Material:
     if not numbers.get("emissive", np.zeros(3)).any():
         numbers.pop("emissive", None)
     # The map of the ambient colour is mostly that of the diffuse one.
-    unread = tuple(key for key, file in values.get("unread", {}).items() if file != texture)
-    options = tuple(f"{name} of {key}" for key, names in values.get("options", {}).items() for name in names)
-    return Material(color, texture, numbers, values.get("maps", {}), unread, options)
+    unread = [key for key, file in values.get("unread", {}).items() if file != texture]
+    maps, options = dict(values.get("maps", {})), dict(values.get("options", {}))
+    if {"normal_map", "bump"} <= {*maps}:
+        del options["map_bump"]
+        if maps.pop("bump") != maps["normal_map"]:
+            unread.append("map_bump")
+    unfollowed = [f"{name} of {key}" for key, names in options.items() for name in names]
+    return Material(color, texture, numbers, maps, values.get("multiplier", 1.0), tuple(unread), tuple(unfollowed))

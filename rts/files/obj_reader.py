@@ -249,10 +249,15 @@ def read_obj(path: Path) -> list[Piece]:
     used = {material for _, _, material in lines.faces}
     looks = {name: materials.get(name, Material()) for name, index in lines.materials.items() if index in used}
     textures = {name: read_texture(look.texture, path) for name, look in looks.items() if look.texture is not None}
-    entries = {name: look.entries(path) for name, look in looks.items()}
+    read = {name: look.entries(path) for name, look in looks.items()}
     unread = [f"{key} of {name!r}" for name, look in looks.items() for key in look.unread]
     options = [f"{option} of {name!r}" for name, look in looks.items() for option in look.options]
-    kinds = (("maps that are not read", unread), ("options of maps that are not followed", options))
+    mistaken = [f"that of {name!r}" for name, (_, taken) in read.items() if taken]
+    kinds = (
+        ("maps that are not read", unread),
+        ("options of maps that are not followed", options),
+        ("bump maps that are taken for normal maps, by their colours", mistaken),
+    )
     notes = [f"{what}: {_some(names)}" for what, names in kinds if names]
     if notes:
         warn(f"{path} has {'; and '.join(notes)}")
@@ -277,7 +282,7 @@ def read_obj(path: Path) -> list[Piece]:
         colors = _colors(v)
         if colors is not None:
             attributes["colors"] = (colors, faces)
-        pieces.append(Piece(vertices, faces, attributes, textures.get(name), looks[name].color, entries=entries[name]))
+        pieces.append(Piece(vertices, faces, attributes, textures.get(name), looks[name].color, entries=read[name][0]))
     return pieces
 
 

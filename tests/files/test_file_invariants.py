@@ -285,7 +285,7 @@ f 1/1/1 2/2/1 3/-1/-1 4/1/1
 usemtl b
 f -4/1/1 -3/1/1 4/2/1
 """
-MTL = b"newmtl a\nKd 0.5 0.25 1\nd 0.5\nnewmtl b\nmap_Kd -s 1 1 1 t.png\nTr 0.1\n"
+MTL = b"newmtl a\nKd 0.5 0.25 1\nd 0.5\nnewmtl b\nmap_Kd -s 1 1 1 t.png\nTr 0.1\nbump -bm 0.5 t.png\n"
 TWO = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0.5)], [(0, 1, 2), (1, 3, 2)]
 SOUND = {kind: exported(TWO, kind) for kind in FORMATS}
 RUNS = [

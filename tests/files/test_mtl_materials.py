@@ -49,13 +49,108 @@ def test_a_material_without_them_is_lambert(tmp_path):
     assert isinstance(part.shader, Lambert) and set(part.theta) == {"vertices", "uv", "color"}
 
 
+def picture_of(folder, name, pixels):
+    """A PNG of grey or coloured pixels."""
+    Image.fromarray(np.array(pixels, np.uint8)).save(folder / name)
+
+
+def test_heights_that_rise_along_u_tilt_normals_to_its_other_side(tmp_path):
+    picture_of(tmp_path, "h.png", [[0, 51, 102, 153]])
+    part = loaded(tmp_path, "map_Bump -bm 0.5 h.png")
+    assert isinstance(part.shader, Pbr)
+    normals = part.theta["normal_map"]
+    # The first and last column are beside each other, since textures repeat.
+    slopes = 0.5 * np.array([0.2 - 0.6, 0.4, 0.4, 0 - 0.4]) / 2
+    expected = np.stack([-slopes, 0 * slopes, np.ones(4)], axis=1) / np.hypot(slopes, 1)[:, None]
+    np.testing.assert_allclose(normals, expected[None], atol=1e-6)
+    assert normals.dtype == np.float32 and (normals[0, 1:3, 0] < 0).all()
+
+
+def test_heights_that_rise_along_v_tilt_normals_down_though_rows_go_down(tmp_path):
+    picture_of(tmp_path, "h.png", [[153], [102], [51], [0]])
+    normals = loaded(tmp_path, "bump h.png").theta["normal_map"]
+    slopes = np.array([0 - 0.4, 0.4, 0.4, 0.2 - 0.6]) / 2
+    expected = np.stack([0 * slopes, -slopes, np.ones(4)], axis=1) / np.hypot(slopes, 1)[:, None]
+    np.testing.assert_allclose(normals, expected[:, None], atol=1e-6)
+
+
+def test_a_hill_is_a_hollow_with_the_opposite_multiplier_and_none_without_a_slope(tmp_path):
+    picture_of(tmp_path, "h.png", [[0, 0, 0], [0, 255, 100], [0, 60, 0]])
+    picture_of(tmp_path, "flat.png", np.full((2, 3), 200))
+    hill, hollow = (loaded(tmp_path, f"bump -bm {m} h.png").theta["normal_map"] for m in ("2", "-2"))
+    np.testing.assert_allclose(hollow, hill * [-1, -1, 1], atol=1e-6)
+    for line in ("bump -bm 0 h.png", "bump flat.png"):
+        np.testing.assert_allclose(loaded(tmp_path, line).theta["normal_map"] - [0, 0, 1.0], 0, atol=1e-6)
+
+
+def test_of_a_bump_map_the_multiplier_is_followed_and_other_options_are_not(tmp_path):
+    picture_of(tmp_path, "h.png", [[0, 255, 0]])
+    with pytest.warns(rts.errors.FileWarning, match=r": -s of map_bump of 'm'$"):
+        loaded(tmp_path, "bump -bm 0.5 -s 2 2 2 h.png")
+
+
+def test_the_height_of_a_colour_is_its_luminance(tmp_path):
+    picture_of(tmp_path, "h.png", [[(0, 0, 0), (255, 0, 0), (0, 0, 0), (0, 255, 0)]])
+    normals = loaded(tmp_path, "bump h.png").theta["normal_map"]
+    np.testing.assert_allclose(normals[0, 0, 0] / normals[0, 0, 2], (0.7152 - 0.2126) / 2, rtol=1e-5)
+
+
+def test_light_from_the_side_brightens_the_slope_that_faces_it(tmp_path):
+    heights = 127 * (1 + np.cos(np.linspace(0, 2 * np.pi, 64, endpoint=False)))  # Lowest in the middle.
+    for name, pixels, direction in (("u.png", heights[None], (1, 0, 1)), ("v.png", heights[:, None], (0, 1, 1))):
+        picture_of(tmp_path, name, pixels)
+        part = loaded(tmp_path, f"bump -bm 20 {name}")
+        light = {"direction": np.array([direction], float), "color": np.ones((1, 3)), "ambient": np.zeros(3)}
+        part = part.replace(theta={**part.theta, "light": light})
+        camera = rts.Camera.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), fov_y=15)
+        image = np.asarray(rts.render(part, camera, (16, 16)))[..., 0]
+        # Before the middle heights fall, and face what is beyond it.
+        faces, turns = (image[:, 4:6], image[:, 10:12]) if name == "u.png" else (image[10:12], image[4:6])
+        assert faces.mean() > 1.2 * turns.mean()
+
+
+def test_a_bump_map_with_the_colours_of_a_normal_map_is_taken_for_one(tmp_path):
+    pixels = np.array([[(128, 128, 255), (150, 110, 240), (0, 0, 0)]], np.uint8)
+    picture_of(tmp_path, "n.png", pixels)
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        part = loaded(tmp_path, "map_Bump -bm 0.5 n.png")
+    [warning] = caught
+    assert str(warning.message) == (
+        f"{tmp_path / 'm.obj'} has bump maps that are taken for normal maps, by their colours: that of 'm'"
+    )
+    np.testing.assert_allclose(part.theta["normal_map"], (pixels / 127.5 - 1) * [0.5, 0.5, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("grey", [0, 128, 200, 255])
+def test_grey_is_never_taken_for_a_normal_map(tmp_path, grey):
+    picture_of(tmp_path, "h.png", [[grey, grey], [grey, 0]])
+    normals = loaded(tmp_path, "map_Bump h.png").theta["normal_map"]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
+
+
+def test_a_normal_map_goes_before_a_bump_map(tmp_path):
+    picture(tmp_path, "n.png", (255, 128, 255))
+    picture_of(tmp_path, "h.png", [[0, 255, 0]])
+    with pytest.warns(rts.errors.FileWarning, match=r"has maps that are not read: map_bump of 'm'$"):
+        part = loaded(tmp_path, "bump -s 2 2 2 h.png\nnorm n.png")
+    np.testing.assert_allclose(part.theta["normal_map"], [[[1, 2 * 128 / 255 - 1, 1]]], atol=1e-6)
+    assert part.theta["normal_map"].shape == loaded(tmp_path, "norm n.png\nbump n.png").theta["normal_map"].shape
+
+
+@pytest.mark.parametrize("values", ["", "nan", "inf", "much", "1.2.3", "1e999", "-1e7", "1 2"])
+def test_multipliers_that_are_not_one_number_are_refused_with_their_line(tmp_path, values):
+    picture(tmp_path, "h.png", (9, 9, 9))
+    with pytest.raises(rts.InputError, match=r"m.mtl, line 2: -bm is '.*' in '-bm .*h.png'; expected one number"):
+        loaded(tmp_path, f"map_Bump -bm {values} h.png")
+
+
 def test_other_maps_are_named_in_one_warning_but_for_copies_of_the_texture(tmp_path):
     picture(tmp_path, "t.png", (255, 0, 0))
     with pytest.warns(rts.errors.FileWarning) as caught:
-        loaded(tmp_path, "map_Kd t.png\nmap_Ka t.png\nmap_Bump b.png\nmap_Ks s.png\nmap_d a.png\ndisp d.png")
+        loaded(tmp_path, "map_Kd t.png\nmap_Ka t.png\nmap_Ks s.png\nmap_d a.png\ndisp d.png\nrefl r.png")
     [warning] = caught
     assert str(warning.message) == (
-        f"{tmp_path / 'm.obj'} has maps that are not read: map_bump of 'm', map_ks of 'm', map_d of 'm' and 1 more"
+        f"{tmp_path / 'm.obj'} has maps that are not read: map_ks of 'm', map_d of 'm', disp of 'm' and 1 more"
     )
 
 
