@@ -65,7 +65,7 @@ def truth(room: np.ndarray, normal: np.ndarray, roughness: float, samples: int) 
     weight = to_light * (viewer[2] + of_viewer) / (to_light * of_viewer + viewer[2] * of_light + 1e-12)
     fresnel = (1 - np.clip(to_half, 0, 1)) ** 5
     weight = weight * (REFLECTANCE * (1 - fresnel) + fresnel)
-    return (weight[:, None] * _looked_up([room], light @ axes)).mean(axis=0)
+    return (weight[:, None] * _looked_up(room, light @ axes)).mean(axis=0)
 
 
 def blurred(room: np.ndarray, mean: np.ndarray, roughness: float, samples: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def blurred(room: np.ndarray, mean: np.ndarray, roughness: float, samples: int) 
     weight = light / (light + np.sqrt(light**2 * (1 - square) + square))
     sine = np.sqrt(np.clip(1 - cosine**2, 0, 1))
     ways = np.stack([sine * np.cos(turns), sine * np.sin(turns), cosine], axis=1) @ frame(mean)
-    return (weight[:, None] * _looked_up([room], ways)).sum(axis=0) / weight.sum()
+    return (weight[:, None] * _looked_up(room, ways)).sum(axis=0) / weight.sum()
 
 
 def main() -> None:

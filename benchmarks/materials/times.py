@@ -74,7 +74,12 @@ def main() -> None:
                 row += [f"{lambert:.0f}", f"{pbr:.0f}", f"{pbr / lambert:.1f}"]
             lines.append(row)
             print(row, flush=True)
-    print(table(["scene", "light", "lambert", "pbr", "ratio", "lambert, gradient", "pbr, gradient", "ratio"], lines))
+    print(
+        table(
+            ["scene", "light", "lambert", "pbr", "ratio", "lambert, gradient", "pbr, gradient", "ratio, gradient"],
+            lines,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def prefiltered(image: Array) -> dict[str, Array]:
     xp, engine = namespace(image), engine_of(image)
     small = next(x for x in reversed(mip_levels(image)) if x.shape[0] >= ROWS or x.shape == image.shape)
     grid = engine.constant(_directions().reshape(-1, 3), image)
-    middle = xp.reshape(_looked_up([small], grid), (ROWS, 2 * ROWS, 3))
+    middle = xp.reshape(_looked_up(small, grid), (ROWS, 2 * ROWS, 3))
     weights, waves, polynomials, blurs = (engine.constant(x, image) for x in _tables())
     sh = xp.sum(weights[:, :, None] * xp.reshape(middle, (1, -1, 3)), axis=1)
     # Each row in cosines and sines of the longitude, then each of these in Legendre functions of the latitude.
@@ -65,7 +65,7 @@ def turned_environment(image: Array, rotation: Array) -> Array:
     xp, engine, (height, width) = namespace(image), engine_of(image), image.shape[:2]
     grid = engine.constant(_directions(height, width).reshape(-1, 3), image)
     ways = sum(grid[:, i : i + 1] * rotation[:, i] for i in range(3))
-    return xp.reshape(_looked_up([image], ways), image.shape)
+    return xp.reshape(_looked_up(image, ways), image.shape)
 
 
 def reflected(environment: Mapping[str, Array], directions: Array, roughness: Array) -> Array:
@@ -77,45 +77,65 @@ def reflected(environment: Mapping[str, Array], directions: Array, roughness: Ar
         roughness: perceptual, 0 to 1.
     """
     xp, engine, levels = namespace(directions), engine_of(directions), environment["levels"]
-    number, below = 0 * roughness, ROUGHNESS[:-1]
-    for low, high in zip(below, ROUGHNESS[1:], strict=True):
-        number = number + xp.clip((roughness - low) / (high - low), 0.0, 1.0)
-    finer = xp.clip(xp.floor(engine.stop_gradient(number)), 0.0, len(below) - 1.0)
+    low, step = (engine.constant(x, roughness) for x in (np.array(ROUGHNESS[:-1]), np.diff(ROUGHNESS)))
+    number = xp.sum(xp.clip((roughness - low) / step, 0.0, 1.0), axis=1, keepdims=True)
+    finer = xp.clip(xp.floor(engine.stop_gradient(number)), 0.0, len(ROUGHNESS) - 2.0)
     images, share = [environment["image"], *(levels[i, ...] for i in range(levels.shape[0]))], number - finer
-    index = xp.astype(xp.where(finer == finer, finer, 0 * finer)[:, 0], xp.int32)
-    first = _looked_up(images, directions, index)
-    return first + share * (_looked_up(images, directions, index + 1) - first)
+    index = xp.astype(xp.where(finer == finer, finer, 0.0)[:, 0], xp.int32)
+    u, v = _places(directions)
+    sizes = np.array([x.shape[:2] for x in images], np.float32)
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int32)
+    table = xp.concat([xp.reshape(x, (-1, 3)) for x in images])
+
+    def of_image(number: Array) -> Array:
+        size = xp.take(engine.constant(sizes, u), number, axis=0)
+        return _bilinear(table, u, v, size[:, 0], size[:, 1], xp.take(engine.constant(starts, u), number, axis=0))
+
+    first = of_image(index)
+    return first + share * (of_image(index + 1) - first)
 
 
-def _looked_up(images: list[Array], directions: Array, number: Array | None = None) -> Array:
-    """Bilinear lookup (N, 3) of unit directions (N, 3) in equirectangular images; of each in image `number` (N,)."""
-    xp, engine = namespace(images[0], directions), engine_of(images[0], directions)
+def _looked_up(image: Array, directions: Array) -> Array:
+    """Bilinear lookup (N, 3) of unit directions (N, 3) in an equirectangular image (h, w, 3)."""
+    (height, width), table = image.shape[:2], namespace(image).reshape(image, (-1, 3))
+    return _bilinear(table, *_places(directions), float(height), float(width), 0)
+
+
+def _places(directions: Array) -> tuple[Array, Array]:
+    """Shares (N,) of the width and of the height of an equirectangular image at which directions (N, 3) are seen."""
+    xp = namespace(directions)
     x, y, z = (directions[:, i] for i in range(3))
     # At the poles all longitudes are one.
     pole = x * x + z * z < 1e-12
     x, z = xp.where(pole, 0 * x, x), xp.where(pole, 0 * z - 1e-6, z)
-    u, v = 0.5 + xp.atan2(x, -z) / (2 * np.pi), xp.atan2(xp.sqrt(x * x + z * z), y) / np.pi
-    sizes = np.array([x.shape[:2] for x in images], np.float32)
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int32)
-    if number is None:
-        height, width, start = float(sizes[0, 0]), float(sizes[0, 1]), 0
-    else:
-        height, width = (xp.take(engine.constant(size, u), number, axis=0) for size in sizes.T)
-        start = xp.take(engine.constant(starts), number, axis=0)
+    return 0.5 + xp.atan2(x, -z) / (2 * np.pi), xp.atan2(xp.sqrt(x * x + z * z), y) / np.pi
+
+
+def _bilinear(
+    table: Array, u: Array, v: Array, height: Array | float, width: Array | float, start: Array | int
+) -> Array:
+    """Bilinear lookup (N, 3) at shares (N,) of width and height in images whose texels are rows of a table (T, 3).
+
+    Args:
+        table: texels.
+        u: shares of the width; columns repeat.
+        v: shares of the height.
+        height: the image's rows, of each lookup (N,) or of all.
+        width: its columns.
+        start: the row of its first texel.
+    """
+    xp, stop = namespace(table, u), engine_of(u).stop_gradient
     column, row = u * width - 0.5, v * height - 0.5
-    left, top = (xp.floor(engine.stop_gradient(place)) for place in (column, row))
+    # What is no number names some texel, and stays none by its shares.
+    left, top = (xp.where(x == x, x, 0.0) for x in (xp.floor(stop(column)), xp.floor(stop(row))))
     right, down = (column - left)[:, None], (row - top)[:, None]
-    table = xp.concat([xp.reshape(x, (-1, 3)) for x in images]) if len(images) > 1 else xp.reshape(images[0], (-1, 3))
+    columns = [x - xp.floor(x / width) * width for x in (left, left + 1)]
+    rows = [xp.clip(xp.clip(x, 0.0, None), None, height - 1) for x in (top, top + 1)]
 
-    def at(across: int, below: int) -> Array:
-        there = left + across
-        there = there - xp.floor(there / width) * width
-        index = xp.clip(xp.clip(top + below, 0.0, None), None, height - 1) * width + xp.clip(there, 0.0, width - 1)
-        index = xp.astype(xp.where(index == index, index, 0 * index), xp.int32)
-        return xp.take(table, index + start, axis=0)
-
-    upper = at(0, 0) + right * (at(1, 0) - at(0, 0))
-    lower = at(0, 1) + right * (at(1, 1) - at(0, 1))
+    index = [xp.astype(y * width + x, xp.int32) + start for y in rows for x in columns]
+    texels = xp.reshape(xp.take(table, xp.concat(index), axis=0), (4, -1, 3))
+    upper = texels[0, ...] + right * (texels[1, ...] - texels[0, ...])
+    lower = texels[2, ...] + right * (texels[3, ...] - texels[2, ...])
     return upper + down * (lower - upper)
 
 

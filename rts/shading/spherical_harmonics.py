@@ -50,8 +50,8 @@ def radiance(sh: Array, directions: Array, factors: Array) -> Array:
     """
     engine, count = engine_of(sh, directions), min(sh.shape[0], factors.shape[-1] ** 2)
     xp = engine.namespace
-    orders = np.repeat(np.arange(4), [1, 3, 5, 7])[:count]
-    sh, basis = sh[:count, ...], harmonics(directions, count) * xp.take(factors, engine.constant(orders), axis=-1)
+    orders = engine.constant(np.repeat(np.arange(4), [1, 3, 5, 7])[:count], directions)
+    sh, basis = sh[:count, ...], harmonics(directions, count) * xp.take(factors, orders, axis=-1)
     total = basis @ sh if engine.exact_products(basis, sh) else xp.sum(basis[:, :, None] * sh[None], axis=1)
     return xp.where(total > 0, total, 0 * total)
 

@@ -57,7 +57,7 @@ def sample_texture(
     levels, engine = mip_levels(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
     sizes = np.array([x.shape[:2] for x in levels])
-    first = engine.constant(np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1))
+    first = engine.constant(np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1), uv)
     heights, widths = (engine.constant(x.astype(np.float32), uv) for x in sizes.T)
 
     def averaged(uv: Array, level: Array, step: Array, count: Array, most: int) -> Array:
@@ -86,11 +86,11 @@ def sample_texture(
         if end == len(known) and start == 0:
             return averaged(*rows, most)
         if end > start:
-            here = engine.constant(order[start:end])
+            here = engine.constant(order[start:end], uv)
             a, b, c, d = (xp.take(x, here, axis=0) for x in rows)
             found.append(averaged(a, b, c, d, most))
             start = end
-    return xp.take(xp.concat(found), engine.constant(np.argsort(order)), axis=0)
+    return xp.take(xp.concat(found), engine.constant(np.argsort(order), uv), axis=0)
 
 
 def mip_levels(texture: Array) -> list[Array]:
@@ -199,4 +199,4 @@ def _wrapped(index: Array, count: Any, wrap: str) -> Array:
     elif wrap == "mirror":
         index = index - xp.floor(index / (2 * count)) * (2 * count)
         index = xp.where(index >= count, 2 * count - 1 - index, index)
-    return xp.astype(xp.clip(index, 0, count - 1), xp.int32)
+    return xp.astype(xp.clip(xp.clip(index, 0.0, None), None, count - 1), xp.int32)

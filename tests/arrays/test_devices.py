@@ -24,6 +24,7 @@ from helpers import icosphere, relative_error, to_numpy
 import rts
 from benchmarks.gpu.run import counts
 from rts.arrays.trees import leaves, map_leaves
+from rts.shadows import with_shadows
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.devices
@@ -155,8 +156,26 @@ def isosurface(**options):
     return rts.Part(surface, {"radius": np.array(0.9)}, "normals")
 
 
+def reflecting():
+    """A ball half of metal in the light of an image of all around."""
+    room = {"environment": np.random.default_rng(2).uniform(0.2, 1, (8, 16, 3))}
+    part = ball("pbr")
+    return part.replace(theta={**part.theta, "metallic": np.array(0.5), "roughness": np.array(0.45), "light": room})
+
+
+def embossed():
+    """A textured ball with a normal map, half of metal, under a lamp."""
+    part, rng = textured("pbr"), np.random.default_rng(2)
+    bent = np.concatenate([rng.uniform(-0.3, 0.3, (8, 8, 2)), np.ones((8, 8, 1))], axis=2)
+    light = {"direction": np.array([0.3, 1, 1]), "ambient": np.array(0.2), "sh": rng.uniform(0, 0.2, (9, 3))}
+    return part.replace(theta={**part.theta, "normal_map": bent, "metallic": np.array(0.5), "light": light})
+
+
 CASES = {
-    **{name: lambda name=name: Case((example(name),)) for name in ("mesh", "bezier", "bspline", "revolution")},
+    **{
+        name: lambda name=name: Case((example(name),))
+        for name in ("mesh", "skinned", "bezier", "bspline", "revolution")
+    },
     "subdivision": lambda: Case((example("subdivision"),)),
     "isosurface": lambda: Case((example("isosurface"),)),
     "sdf": lambda: Case((example("sdf"),)),
@@ -170,7 +189,10 @@ CASES = {
         name: lambda name=name: Case((ball(name),))
         for name in ("unlit", "normals", "silhouette", "blinn_phong", "depth")
     },
+    "environment": lambda: Case((reflecting(),)),
     "texture": lambda: Case((textured(),)),
+    "normal map": lambda: Case((embossed(),)),
+    "mipmaps": lambda: Case((textured(rts.plugin("shaders", "unlit")(mip=True)),)),
     "lit texture": lambda: Case((textured("lambert"),)),
     **{
         name: lambda name=name: Case((ball(),), {"sampler": name})
@@ -229,9 +251,42 @@ def needed(name):
 
 # --------------------------------------------------------------------------------------------------------- images
 
-QUICK = ("mesh", "sdf", "lit texture")
+QUICK = ("mesh", "sdf", "lit texture", "environment", "mipmaps")
 """Cases for `make test`."""
 EVERY_CASE = [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES]
+
+
+NAMES = ("color", "depth", "normal", "uv", "alpha", "depth_front", "part", "triangle")
+
+
+def test_outputs_are_those_of_the_cpu(place):
+    def outputs(place):
+        parts = [place.put(dict(part.theta)) for part in (textured("lambert"), ball("unlit", (0.7, 0.3, 0.4)))]
+        made = [textured("lambert").replace(theta=parts[0]), ball("unlit").replace(theta=parts[1])]
+        return rts.render(made, CAMERA, SIZE, outputs=NAMES)
+
+    found, expected = place.take(outputs(place)), to_numpy(outputs(CPU))
+    for name in NAMES:
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-5, err_msg=name)
+
+
+def test_shadows_are_those_of_the_cpu(place):
+    wall = np.array([(-3, -3, -1.5), (3, -3, -1.5), (3, 3, -1.5), (-3, 3, -1.5)])
+
+    def of(place):
+        def loss(tree):
+            floor = rts.Part(rts.Mesh([(0, 1, 2), (0, 2, 3)]), {"vertices": place.put(wall)}, "lambert")
+            caster = rts.Part(rts.Mesh(FACES), {"vertices": place.put(BALL) + tree["move"]}, "lambert")
+            light = {"direction": tree["direction"], "ambient": 0.2}
+            parts = with_shadows([caster, floor], light, size=32)
+            return (rts.render(parts, CAMERA, SIZE)[..., :3] ** 2).sum()
+
+        return place.gradient(loss, place.put({"move": np.zeros(3), "direction": np.array([0.3, 0.5, 1.0])}))
+
+    (value, slopes), (expected, others) = place.take(of(place)), to_numpy(of(CPU))
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+    for name, slope in others.items():
+        np.testing.assert_allclose(slopes[name], slope, atol=1e-3 * np.linalg.norm(slope), err_msg=name)
 
 
 @pytest.mark.parametrize("name", EVERY_CASE)

@@ -115,7 +115,7 @@ def test_an_environment_is_reflected_as_4096_samples_of_it_are():
     assert 9 < image.mean(axis=2).max() / image.mean(axis=2).min() < 10
     light, errors = {"environment": image}, []
     for metallic, roughness in [(m, r) for m in (0.0, 1.0) for r in (0.2, 0.4, 0.7, 1.0)]:
-        expected = sampled(points, toward, metallic, roughness, lambda way: _looked_up([image], way))
+        expected = sampled(points, toward, metallic, roughness, lambda way: _looked_up(image, way))
         difference = shaded(points, metallic, roughness, light) - expected
         errors.append(np.sqrt((difference**2).mean() / (expected**2).mean()))
     assert max(errors) < 0.03, errors
