@@ -9,6 +9,7 @@ a GPU does nothing. Compiling an extension ends the script with one line.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import importlib.util
 import os
@@ -31,18 +32,24 @@ MISSING = {
 }
 """Modules that cannot be had, and how to say so."""
 IGNORED = (
-    "synchronize empty_cache set_device init reset_peak_memory_stats reset_max_memory_allocated "
-    "is_current_stream_capturing"
+    "synchronize empty_cache ipc_collect set_device set_stream init reset_peak_memory_stats reset_max_memory_allocated "
+    "reset_max_memory_cached reset_accumulated_memory_stats set_per_process_memory_fraction is_current_stream_capturing"
 )
 """Functions of `torch.cuda` that do nothing here, separated by spaces."""
 FACTORIES = (
-    "arange as_tensor asarray empty empty_like empty_strided eye full full_like hamming_window hann_window linspace "
-    "logspace normal ones ones_like rand rand_like randint randint_like randn randn_like randperm scalar_tensor "
-    "sparse_coo_tensor tensor tril_indices triu_indices zeros zeros_like"
+    "arange as_tensor asarray bartlett_window blackman_window empty empty_like empty_permuted empty_strided eye full "
+    "full_like hamming_window hann_window kaiser_window linspace logspace normal ones ones_like rand rand_like randint "
+    "randint_like randn randn_like randperm range scalar_tensor sparse_bsc_tensor sparse_bsr_tensor "
+    "sparse_compressed_tensor sparse_coo_tensor sparse_csc_tensor sparse_csr_tensor tensor tril_indices triu_indices "
+    "zeros zeros_like"
 )
 """Functions of torch that take a device, separated by spaces."""
-METHODS = "new_empty new_full new_ones new_tensor new_zeros"
+FREQUENCIES = "fftfreq rfftfreq"
+"""Functions of `torch.fft` that do."""
+METHODS = "new_empty new_empty_strided new_full new_ones new_tensor new_zeros"
 """Methods of tensors that do."""
+CAPABILITY = 7, 0
+"""Compute capability: nvdiffrast needs no more, and scripts take no way that is meant for GPUs of 8.0 or later."""
 
 
 def _cpu(x: Any) -> Any:
@@ -61,8 +68,7 @@ def _redirected(function: Callable, places: tuple[int, ...] = ()) -> Callable:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if "device" in kwargs:
-            kwargs["device"] = _cpu(kwargs["device"])
+        kwargs |= {name: _cpu(kwargs[name]) for name in ("device", "dtype") if name in kwargs}
         kwargs.pop("pin_memory", None)
         return function(*(_cpu(x) if i in places else x for i, x in enumerate(args)), **kwargs)
 
@@ -81,6 +87,17 @@ def _numbered_device(x: torch.Tensor) -> torch.device:
     """The device of a tensor; the CPU has the number 0, as a GPU would."""
     device = _device.__get__(x)
     return torch.device("cpu", 0) if device.type == "cpu" else device
+
+
+@dataclasses.dataclass(frozen=True)
+class _Properties:
+    """Properties of the device, as `torch.cuda.get_device_properties` names them."""
+
+    total_memory: int
+    name: str = "CPU (rts_nvdiffrast)"
+    major: int = CAPABILITY[0]
+    minor: int = CAPABILITY[1]
+    multi_processor_count: int = os.cpu_count() or 1
 
 
 class _Event:
@@ -150,6 +167,7 @@ def _modules() -> dict[str, ModuleType]:
 def _names(pretend: bool) -> list[tuple[Any, dict[str, Any]]]:
     """Modules and classes of torch, with what some of their names are for a script."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 1 << 34
+    properties = _Properties(memory)
     of_torch = {name: _redirected(getattr(torch, name)) for name in FACTORIES.split()} | {
         "Generator": _Generator,
         "load": functools.partial(_on_the_cpu, torch.load),
@@ -163,10 +181,13 @@ def _names(pretend: bool) -> list[tuple[Any, dict[str, Any]]]:
         "Event": _Event,
         "Stream": lambda *_, **__: _Stream(),
         "current_stream": lambda device=None: _Stream(),
+        "default_stream": lambda device=None: _Stream(),
         "device": _Nothing,
         "stream": _Nothing,
         "current_device": lambda: 0,
-        "get_device_name": lambda device=None: "CPU (rts_nvdiffrast)",
+        "get_device_name": lambda device=None: properties.name,
+        "get_device_properties": lambda device=None: properties,
+        "get_device_capability": lambda device=None: CAPABILITY,
         "mem_get_info": lambda device=None: (memory, memory),
     }
     of_cuda |= {name: getattr(torch, name) for name in dir(torch.cuda) if name.endswith("Tensor")}
@@ -176,6 +197,7 @@ def _names(pretend: bool) -> list[tuple[Any, dict[str, Any]]]:
     return [
         (torch, of_torch),
         (torch.Tensor, of_tensors),
+        (torch.fft, {name: _redirected(getattr(torch.fft, name)) for name in FREQUENCIES.split()}),
         (torch.cuda, of_cuda),
         (torch.jit, {"script": _itself}),
         (torch.utils, compiling),

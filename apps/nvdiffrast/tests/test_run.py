@@ -75,19 +75,46 @@ x = torch.cuda.FloatTensor([1, 2])
 assert x.dtype == torch.float32 and isinstance(x, torch.cuda.FloatTensor)
 assert torch.cuda.LongTensor(3).fill_(1).type("torch.cuda.DoubleTensor").dtype == torch.float64
 assert x.type(torch.cuda.IntTensor).dtype == torch.int32 and x.type(torch.int64).dtype == torch.int64
+assert x.type(dtype="torch.cuda.DoubleTensor").dtype == torch.float64 == x.type(dtype=torch.cuda.DoubleTensor).dtype
+assert x.to(dtype=torch.float16).dtype == torch.float16 and torch.ones(2, dtype=torch.int32).dtype == torch.int32
 assert x.type() == "torch.FloatTensor" and x.new_zeros(3, device="cuda").tolist() == [0, 0, 0]
 """,
     "what a device is": """
 assert "CPU" in torch.cuda.get_device_name() and "CPU" in torch.cuda.get_device_name(0)
 free, total = torch.cuda.mem_get_info()
 assert total >= free > 1 << 20
+properties = torch.cuda.get_device_properties(0)
+assert properties.name == torch.cuda.get_device_name() and properties.total_memory == total
+assert (properties.major, properties.minor) == torch.cuda.get_device_capability() == torch.cuda.get_device_capability(0)
+assert properties.major >= 5 and properties.multi_processor_count >= 1
+assert torch.cuda.get_device_properties(torch.device("cuda")) == properties
 x = torch.zeros(2, device="cuda")
 assert "cuda:%d" % x.device.index == "cuda:0" and torch.ones(2, device=x.device).device == x.device
 assert torch.device("cuda").type == "cuda" and isinstance(torch.device("cuda", 0), torch.device)
 """,
+    "functions that take a device": """
+import warnings
+for window in (torch.bartlett_window, torch.blackman_window, torch.kaiser_window, torch.hann_window):
+    assert torch.equal(window(8, device="cuda"), window(8))
+assert torch.fft.fftfreq(4, device="cuda:0").shape == (4,) and torch.fft.rfftfreq(4, device="cuda").shape == (3,)
+assert torch.signal.windows.gaussian(4, std=1.0, device="cuda").shape == (4,)
+assert torch.empty_permuted((2, 3), (1, 0), device="cuda").stride() == (1, 2)
+assert torch.ones(2).new_empty_strided((2, 3), (1, 2), device="cuda").stride() == (1, 2)
+warnings.simplefilter("ignore")
+rows = torch.sparse_csr_tensor(torch.tensor([0, 1, 2]), torch.tensor([1, 0]), torch.ones(2), (2, 2), device="cuda")
+assert rows.to_dense().tolist() == [[0, 1], [1, 0]]
+""",
+    "memory": """
+torch.cuda.ipc_collect()
+torch.cuda.reset_accumulated_memory_stats()
+torch.cuda.reset_max_memory_cached()
+torch.cuda.set_per_process_memory_fraction(0.5)
+""",
     "streams": """
 stream = torch.cuda.Stream()
 stream.wait_stream(torch.cuda.current_stream())
+stream.wait_stream(torch.cuda.default_stream())
+torch.cuda.set_stream(stream)
 with torch.cuda.stream(stream):
     torch.cuda.current_stream().synchronize()
 """,
