@@ -1,9 +1,11 @@
 """`antialias`: its values, and its derivatives against coverage that is known and against area-sampled images."""
 
+import numpy as np
 import pytest
 import rts_nvdiffrast.torch as dr
 import scenes
 import torch
+import trimesh
 
 import rts
 
@@ -92,6 +94,22 @@ class TestOfAPose:
     """The derivative of a loss in a pose, beside differences of images of 8 × 8 samples a pixel."""
 
     SIZE, FINE, STEP = 96, 8, 0.01
+    POSES = dict.fromkeys(("sphere", "box"), (0.4, 0.6, 0.1, 0.05, -0.1, 0.1)) | {
+        "torus": (0.53, -0.56, 2.72, 0.13, 0.17, 0.04),
+        "capsule": (-1.34, -2.21, -0.41, -0.18, -0.05, -0.04),
+    }
+    """Rotation vectors and shifts; those of torus and capsule are poses of `benchmarks/nvdiffrast.py`."""
+
+    def shape(self, name):
+        """Vertices, faces, and a vector for each vertex, which makes its colour."""
+        if name == "sphere":
+            points, faces, _ = scenes.sphere(24, 48)
+            return points, faces, points
+        if name == "box":
+            return scenes.CUBE, scenes.CUBE_FACES, scenes.CUBE
+        mesh = trimesh.creation.torus(0.8, 0.3) if name == "torus" else trimesh.creation.capsule(0.8, 0.4)
+        points, faces, normals = (np.array(x) for x in (mesh.vertices, mesh.faces, mesh.vertex_normals))
+        return torch.tensor(points).float(), torch.tensor(faces).int(), torch.tensor(normals).float()
 
     def image(self, shape, pose, fine=None):
         points, faces, color = shape
@@ -104,12 +122,12 @@ class TestOfAPose:
         return image[0].reshape(self.SIZE, fine, self.SIZE, fine, -1).mean((1, 3)).double()
 
     @pytest.mark.parametrize("colored", [False, True])
-    @pytest.mark.parametrize("name, first", [("sphere", 3), ("box", 0)])
+    @pytest.mark.parametrize("name, first", [("sphere", 3), ("box", 0), ("torus", 0), ("capsule", 0)])
     def test_is_that_of_areas(self, name, first, colored):
         """A sphere's mask does not tell how it is turned: only shifts count."""
-        points, faces = scenes.sphere(24, 48)[:2] if name == "sphere" else (scenes.CUBE, scenes.CUBE_FACES)
-        shape = points, faces, 0.5 + 0.5 * points if colored else torch.ones(len(points), 1)
-        pose = torch.tensor([0.4, 0.6, 0.1, 0.05, -0.1, 0.1], requires_grad=True)
+        points, faces, directions = self.shape(name)
+        shape = points, faces, 0.5 + 0.5 * directions if colored else torch.ones(len(points), 1)
+        pose = torch.tensor(self.POSES[name], requires_grad=True)
         goal = pose.detach() + torch.tensor([0.05, -0.03, 0.04, 0.04, 0.05, -0.06])
         with torch.no_grad():
             target, here = self.image(shape, goal, self.FINE), self.image(shape, pose, self.FINE)
