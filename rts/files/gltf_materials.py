@@ -16,8 +16,10 @@ STATED = ("metallicFactor", "roughnessFactor", "metallicRoughnessTexture")
 """Entries of `pbrMetallicRoughness` beside the base colour."""
 LARGEST = 1e6
 """The largest factor."""
-SPECULAR = "KHR_materials_pbrSpecularGlossiness"
+OLDER = "KHR_materials_pbrSpecularGlossiness"
 """An older kind of material; of what it is made of, the diffuse colour is read."""
+SPECULAR = "KHR_materials_specular"
+"""The strength and the colour of what anything but metals reflects."""
 
 
 class Material(NamedTuple):
@@ -28,8 +30,8 @@ class Material(NamedTuple):
         texture: (h, w, 3 or 4) of the base colour, as `rts.files.images.pixels` gives it; or None.
         alpha_mode: "OPAQUE", "MASK" or "BLEND".
         cutoff: the least alpha that is shown, of "MASK".
-        entries: entries of θ for the shader `pbr`, linear: "metallic", "roughness", "normal_map", "occlusion" and
-            "emissive", numbers or maps; None where the material tells nothing but its base colour.
+        entries: entries of θ for the shader `pbr`, linear: "metallic", "roughness", "normal_map", "occlusion",
+            "emissive" and "specular", numbers or maps; None where the material tells nothing but its base colour.
         lookup: the way in which all maps are looked up.
         unlit: True if it has no light.
         double_sided: False if it is not seen from behind.
@@ -72,7 +74,7 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
     """A material; refused if a colour or texture is invalid. Notes what is not followed."""
     name, maps = f"material {index}", Maps(gltf)
     look = dict(material.get("pbrMetallicRoughness", {}))
-    older = material.get("extensions", {}).get(SPECULAR, {})
+    older = material.get("extensions", {}).get(OLDER, {})
     for ours, theirs in (("baseColorFactor", "diffuseFactor"), ("baseColorTexture", "diffuseTexture")):
         if theirs in older:
             look[ours] = older[theirs]
@@ -82,7 +84,7 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
     color = unit_colors(gltf, f"baseColorFactor of {name}", factor[None])[0] if "baseColorFactor" in look else None
     texture = maps.read(look, "baseColorTexture", f"the texture of {name}")
     if older:
-        gltf.note(f"{SPECULAR}, of which the diffuse colour alone is read", name)
+        gltf.note(f"{OLDER}, of which the diffuse colour alone is read", name)
     unlit = UNLIT in material.get("extensions", {})
     entries = None if unlit or older else _entries(maps, material, look, name)
     return Material(
@@ -101,7 +103,8 @@ def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: s
     """`Material.entries`; refused where a factor is no number, or out of its range."""
     gltf = maps.gltf
     keys = {*look} & set(STATED) | {*material} & {"normalTexture", "occlusionTexture", "emissiveTexture"}
-    if not keys:
+    shine = material.get("extensions", {}).get(SPECULAR)
+    if not keys and shine is None:
         return None
     surface = maps.read(look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}")
     entries = {}
@@ -124,7 +127,31 @@ def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: s
     if factor.any():
         glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}", srgb=True)
         entries["emissive"] = factor if glow is None else factor * decode_srgb(glow[..., :3])
+    if shine is not None:
+        entries["specular"] = _specular(maps, shine, name)
     return {entry: np.asarray(value, np.float32) for entry, value in entries.items()}
+
+
+def _specular(maps: Maps, shine: dict[str, Any], name: str) -> np.ndarray:
+    """The entry "specular" (3,) or (h, w, 3) of an extension `SPECULAR`: the product of its factors and maps.
+
+    The factor dims grazing reflection, too, by the extension, and not by `pbr`.
+    """
+    gltf = maps.gltf
+    color = np.array(shine.get("specularColorFactor", [1.0] * 3), np.float64)
+    if color.shape != (3,) or not ((color >= 0) & (color <= LARGEST)).all():
+        raise gltf.fail(f"the specularColorFactor of {name} is {color.tolist()}; expected three numbers from 0 on")
+    tint = maps.read(shine, "specularColorTexture", f"the specularColorTexture of {name}", srgb=True)
+    strength = maps.read(shine, "specularTexture", f"the specularTexture of {name}")
+    product = color * _number(gltf, shine, "specularFactor", 1.0, name, most=1.0)
+    product = product if tint is None else product * decode_srgb(tint[..., :3])
+    if strength is not None and strength.shape[-1] == 4:  # Without alpha it is 1.
+        alpha = strength[..., 3:]
+        if tint is not None and tint.shape[:2] != alpha.shape[:2]:
+            gltf.note("a specularTexture of another size than the specularColorTexture, whose mean is taken", name)
+            alpha = alpha.mean()
+        product = product * alpha
+    return product
 
 
 def _number(

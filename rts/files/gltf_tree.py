@@ -22,7 +22,7 @@ APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
 READ = frozenset(
     f"KHR_{name}"
     for name in "mesh_quantization materials_unlit materials_emissive_strength materials_pbrSpecularGlossiness "
-    "lights_punctual".split()
+    "materials_specular lights_punctual".split()
 )
 UNSEEN = re.compile(r"[A-Z]+_(texture|xmp|animation)")
 """Names of extensions begin like this that are read, or that make no difference to what is loaded."""

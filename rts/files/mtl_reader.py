@@ -35,8 +35,11 @@ MAPS = {
     "map_ke": "emissive",
     "norm": "normal_map",
     "map_bump": "bump",
+    "map_ks": "specular",
 }
-"""Statements of maps that it reads, or, of "bump", of which its normal map is made."""
+"""Statements of maps that it reads, or, of "bump", of which its normal map is made; map_Ks only beside another one."""
+BLENDER = 2.0
+"""Times 4 % that a white map_Ks reflects: Blender takes it for a level, which is 4 % in the middle."""
 STEEPEST = 1e6
 """The largest multiplier of heights."""
 
@@ -51,7 +54,8 @@ class Material(NamedTuple):
         texture: file of map_Kd, or None. It replaces Kd.
         numbers: "metallic" () of Pm and "roughness" () of Pr, both in [0, 1], and "emissive" (3,) of Ke, sRGB and not
             black, as far as the material has them.
-        maps: files of "metallic", "roughness", "emissive", and "normal_map" or else "bump". They replace numbers.
+        maps: files of "metallic", "roughness", "emissive", "specular", and "normal_map" or else "bump". They replace
+            numbers.
         multiplier: the option -bm of "bump", by which its slopes are multiplied.
         unread: statements of other maps.
         options: options of maps that are read, which are not followed: "-s of map_kd", for instance.
@@ -82,6 +86,8 @@ class Material(NamedTuple):
                     entries[name] = decode_srgb(pixels)
                 case "normal_map":
                     entries[name] = 2 * pixels - 1
+                case "specular":
+                    entries[name] = BLENDER * pixels
                 case "bump" if holds_normals(pixels):
                     scale = np.array([self.multiplier, self.multiplier, 1], np.float32)  # As the scale of a glTF.
                     entries["normal_map"], mistaken = (2 * pixels - 1) * scale, True
@@ -194,5 +200,8 @@ def _material(values: dict[str, Any]) -> Material:
         del options["map_bump"]
         if maps.pop("bump") != maps["normal_map"]:
             unread.append("map_bump")
+    if {*maps} == {"specular"} and not numbers:
+        del maps["specular"], options["map_ks"]
+        unread.insert(0, "map_ks")
     unfollowed = [f"{name} of {key}" for key, names in options.items() for name in names]
     return Material(color, texture, numbers, maps, values.get("multiplier", 1.0), tuple(unread), tuple(unfollowed))

@@ -39,6 +39,8 @@ class Pbr(Unlit):
         "normal_map" (h, w, 3)           directions x along u, y along v, z outward, of any length; not colours
         "occlusion" () or (h, w, 1)      the share of light from all around that comes in, by default 1
         "emissive" (3,) or (h, w, 3)     light of its own, by default none
+        "specular" (), (3,) or (h, w, 3) how many times 4 % anything but a metal reflects at normal incidence, by
+                                         default 1 (`KHR_materials_specular`); at most all light
 
     Maps are looked up as the texture is. A normal map needs the G-buffer's "tangent".
     """
@@ -46,7 +48,7 @@ class Pbr(Unlit):
     takes_views = True
     reads = (
         *("normal", "color", "uv", "texture", "light", "metallic", "roughness", "normal_map", TANGENT),
-        *("occlusion", "emissive"),
+        *("occlusion", "emissive", "specular"),
     )
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -56,7 +58,9 @@ class Pbr(Unlit):
         metallic, roughness = self._entry(theta, gbuffer, "metallic", 1), self._entry(theta, gbuffer, "roughness", 1)
         metallic = 0.0 if metallic is None else metallic
         roughness = 1.0 if roughness is None else xp.clip(roughness, microfacets.SMOOTHEST, 1.0)
-        reflectance = DIELECTRIC + metallic * (color - DIELECTRIC)
+        specular = self._entry(theta, gbuffer, "specular", 3)
+        dielectric = DIELECTRIC if specular is None else xp.clip(DIELECTRIC * specular, 0.0, 1.0)
+        reflectance = dielectric + metallic * (color - dielectric)
         base = (1 - metallic) * (1 - reflectance) * color
         normal, toward = self._normals(theta, gbuffer, camera), unit(camera.toward(gbuffer["position"]))
         facing, shown = dot(normal, toward), None
@@ -95,7 +99,8 @@ class Pbr(Unlit):
             return None
         shape = shape_of(theta[name])
         if len(shape) != 3 and name != "normal_map":
-            return entry_of(theta, name, *(((), (1,)) if channels == 1 else ((3,),)))
+            numbers = ((3,),) if name == "emissive" else ((), (1,)) if channels == 1 else ((), (1,), (3,))
+            return entry_of(theta, name, *numbers)
         if len(shape) != 3 or shape[2] != channels or 0 in shape:
             raise InputError(f"theta[{name!r}] {described(theta[name])}; expected a map (h, w, {channels})")
         values = self.looked_up(theta[name], gbuffer)

@@ -92,6 +92,22 @@ def test_factors_and_maps_are_multiplied_and_decoded(tmp_path):
     np.testing.assert_allclose(theta["emissive"][0, 0], [2, 0, 4 * linear], atol=1e-5)
 
 
+def test_specular_factors_and_maps_are_multiplied(tmp_path):
+    shine = {"specularFactor": 0.5, "specularColorFactor": [1, 0.5, 2]}
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": {"KHR_materials_specular": shine}}
+    [part] = rts.load(model(tmp_path, material))
+    np.testing.assert_allclose(part.theta["specular"], [0.5, 0.25, 1])
+    shine |= {"specularColorTexture": {"index": 0}, "specularTexture": {"index": 1}}
+    tint, strength = np.array([[[255, 188, 0]]]), np.array([[[0, 0, 0, 51]]])
+    [part] = rts.load(model(tmp_path, material, [tint, strength]))
+    linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(part.theta["specular"], [[[0.1, 0.05 * linear, 0]]], atol=1e-6)
+    for wrong in ({"specularFactor": 1.5}, {"specularColorFactor": [1, 1]}, {"specularColorFactor": [1, -1, 1]}):
+        material["extensions"]["KHR_materials_specular"] = wrong
+        with pytest.raises(rts.InputError, match=f"{next(iter(wrong))} of material 0"):
+            rts.load(model(tmp_path, material))
+
+
 def test_factors_alone_are_numbers_whose_defaults_are_those_of_the_format(tmp_path):
     [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": {"roughnessFactor": 0.3}, "emissiveFactor": [1, 0, 0]}))
     assert {name: part.theta[name].tolist() for name in ("metallic", "roughness")} == {

@@ -144,6 +144,14 @@ def test_multipliers_that_are_not_one_number_are_refused_with_their_line(tmp_pat
         loaded(tmp_path, f"map_Bump -bm {values} h.png")
 
 
+def test_specular_maps_are_read_beside_entries_of_pbr_alone(tmp_path):
+    picture(tmp_path, "s.png", (255, 51, 0))
+    part = loaded(tmp_path, "Pr 0.5\nmap_Ks s.png")
+    np.testing.assert_allclose(part.theta["specular"], [[[2, 0.4, 0]]], atol=1e-6)
+    with pytest.warns(rts.errors.FileWarning, match="maps that are not read: map_ks of 'm'"):
+        assert isinstance(loaded(tmp_path, "Kd 1 1 1\nmap_Ks s.png").shader, Lambert)
+
+
 def test_other_maps_are_named_in_one_warning_but_for_copies_of_the_texture(tmp_path):
     picture(tmp_path, "t.png", (255, 0, 0))
     with pytest.warns(rts.errors.FileWarning) as caught:
@@ -157,9 +165,9 @@ def test_other_maps_are_named_in_one_warning_but_for_copies_of_the_texture(tmp_p
 def test_options_that_are_not_followed_are_named_in_the_same_warning(tmp_path):
     picture(tmp_path, "t.png", (255, 0, 0))
     with pytest.warns(rts.errors.FileWarning) as caught:
-        loaded(tmp_path, "map_Kd -s 2 2 1 -o -0.5 0 0 -bm 1 -clamp on t.png\nmap_Pr -imfchan r t.png\nmap_Ks s.png")
+        loaded(tmp_path, "map_Kd -s 2 2 1 -o -0.5 0 0 -bm 1 -clamp on t.png\nmap_Pr -imfchan r t.png\nmap_d s.png")
     [warning] = caught
     assert str(warning.message) == (
-        f"{tmp_path / 'm.obj'} has maps that are not read: map_ks of 'm'; and options of maps that are not followed: "
+        f"{tmp_path / 'm.obj'} has maps that are not read: map_d of 'm'; and options of maps that are not followed: "
         "-s of map_kd of 'm', -o of map_kd of 'm', -clamp of map_kd of 'm' and 1 more"
     )

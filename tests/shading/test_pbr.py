@@ -42,7 +42,7 @@ def shaded(points, metallic, roughness, light, dtype=np.float64, **theta):
     return Pbr()({**theta, "light": light}, gbuffer, CAMERA)[:, :3]
 
 
-def brdf(normal, toward, light, metallic, roughness):
+def brdf(normal, toward, light, metallic, roughness, dielectric=0.04):
     """The formulas of glTF 2.0, Appendix B.3, written plainly, times the cosine (…, 3), for vectors (…, 3)."""
     half = light + toward
     half = half / np.linalg.norm(half, axis=-1, keepdims=True)
@@ -51,7 +51,7 @@ def brdf(normal, toward, light, metallic, roughness):
     square = roughness**4
     shape = square / (np.pi * (n_h**2 * (square - 1) + 1) ** 2)
     shadowed = n_l * np.sqrt(square + (1 - square) * n_v**2) + n_v * np.sqrt(square + (1 - square) * n_l**2)
-    fresnel = 0.04 * (1 - metallic) + BASE * metallic
+    fresnel = dielectric * (1 - metallic) + BASE * metallic
     fresnel = fresnel + (1 - fresnel) * (1 - v_h) ** 5
     diffuse = (1 - fresnel) * (1 - metallic) * BASE / np.pi
     return np.where(n_l > 0, n_l * (diffuse + fresnel * shape / (2 * np.where(n_l > 0, shadowed, 1))), 0)
@@ -89,6 +89,17 @@ def test_light_from_one_direction_is_that_of_the_formulas(metallic, roughness):
     np.testing.assert_allclose(shaded(points, metallic, roughness, LAMP), expected, rtol=1e-9, atol=1e-12)
     single = shaded(points, metallic, roughness, LAMP, np.float32)
     np.testing.assert_allclose(single, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("specular", [0.5, (0.0, 2.0, 30.0)])
+def test_specular_is_what_dielectrics_reflect_at_most_all(specular):
+    points, toward = ball()
+    direction = LAMP["direction"] / np.linalg.norm(LAMP["direction"])
+    for metallic in (0.0, 0.5, 1.0):
+        dielectric = np.minimum(0.04 * np.asarray(specular), 1)
+        expected = np.pi * LAMP["color"] * brdf(points, toward, direction, metallic, 0.4, dielectric)
+        found = shaded(points, metallic, 0.4, LAMP, specular=specular)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("metallic, roughness", [g for g in GRID if g[1] >= 0.2])

@@ -315,6 +315,7 @@ class TestPbr(ShaderOfBuiltIn):
             "normal_map": np.array([0, 0, 1]) + 0.3 * rng.standard_normal((4, 4, 3)),
             "occlusion": rng.random((2, 2, 1)),
             "emissive": rng.random((2, 3, 3)),
+            "specular": rng.uniform(0.5, 3, (3, 3, 3)),
             "light": light,
         }
         return map_leaves(lambda x: x.astype(np.float32), theta)
