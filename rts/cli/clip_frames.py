@@ -10,6 +10,7 @@ import typer
 import rts
 from rts.files.model_pieces import fault_of
 from rts.scene.default_camera import Bounds, bounds_of
+from rts.scene.model import Model
 from rts.scene.parts import Part
 
 ANIMATIONS = (".gif", ".mp4")
@@ -29,8 +30,8 @@ def check_animation(output: Path, clip: str | None, time: float | None, names: t
 
 def frames_of(
     model: Path, clip: str, time: float | None, moving: bool, cull: str = "none"
-) -> tuple[list[list[Part]], Bounds]:
-    """The parts of a model at one time of a clip, or, if `moving`, at each frame; and the bounds of the whole clip.
+) -> tuple[list[list[Part]], Bounds, Model]:
+    """The parts of a model at one time of a clip, or, if `moving`, at each frame; bounds of the whole clip; the model.
 
     A frame has no parts where the clip hides them all.
 
@@ -56,4 +57,4 @@ def frames_of(
     frames = [parts_at(float(seconds)) for seconds in times]
     if not any(frames):
         raise rts.InputError(f"the clip {clip} of {model} hides all parts then; choose another time")
-    return frames, bounds_of(seen)
+    return frames, bounds_of(seen), loaded

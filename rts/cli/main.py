@@ -20,8 +20,10 @@ from rts.cli.options import (
     OrbitAngles,
     SurfaceName,
     UpAxis,
+    ViewOfModel,
     color_of,
     environment_of,
+    file_camera_of,
     is_given,
     layers_of,
     refuse_beside,
@@ -137,7 +139,7 @@ def render(
     ] = "color",
     surface: SurfaceName = "mesh",
     size: Annotated[str, typer.Option(help="Pixels: 256, or WIDTHxHEIGHT.")] = "256",
-    camera: OrbitAngles = "30,20",
+    camera: ViewOfModel = "30,20",
     fov: FieldOfView = 45.0,
     up: UpAxis = "y",
     sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
@@ -153,7 +155,8 @@ def render(
     environment: Annotated[
         Path | None,
         typer.Option(
-            help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high."
+            help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high. "
+            "Without it, and without --shadows, a GLB or glTF is lit by its own lights, if it has any."
         ),
     ] = None,
     shadows: Annotated[
@@ -186,12 +189,14 @@ def render(
     from rts.cli.pose_file import posed, read_pose
     from rts.diagnostics.measuring_api import size_of, supersample_of
     from rts.files.images import PICTURES
+    from rts.files.lit_models import chosen_camera, load_lit
     from rts.files.paths import output_file
     from rts.rendering.image import over_background
     from rts.scene.default_camera import bounds_of, orbit
     from rts.shading.tone_mapping import check_exposure
 
-    shape, view, color = size_of(size), view_of(camera), color_of(background)
+    shape, own_camera, color = size_of(size), file_camera_of(camera), color_of(background)
+    view = view_of(camera) if own_camera is None else ()
     names = names_of(outputs)
     check_animation(output, clip, time_, names)
     output_file(output, "picture", (*PICTURES, ".npz", *(ANIMATIONS if clip is not None else ())))
@@ -201,20 +206,29 @@ def render(
     check_exposure(exposure or 0.0)
     light: Any = None if environment is None else {"environment": environment_of(environment, up)}
     engine_object = registry.plugin("rts.engines", engine)()
+    own_light = environment is None and not shadows
     if clip is None:
-        frames = [rts.load(model, surface=surface, cull=cull)]
+        loaded = load_lit(model, surface=surface, cull=cull, lights=own_light, cameras=own_camera is not None)
+        frames = [loaded.parts]
         bounds = bounds_of(frames[0])
     else:
         refuse_beside("--clip", context, ("pose", "surface"))
-        frames, bounds = frames_of(model, clip, time_, output.suffix.lower() in ANIMATIONS, cull)
-    if pose is None:
-        seen = orbit(bounds, shape, *view, fov=fov, up=up)
-    else:
+        frames, bounds, loaded = frames_of(model, clip, time_, output.suffix.lower() in ANIMATIONS, cull)
+    if own_light and loaded.lights:
+        light = loaded.lights
+    if pose is not None:
         refuse_beside("--pose", context, ("camera", "fov", "up"))
         matrix, seen, pose_size = read_pose(pose)
         shape = shape if is_given(context, "size") else pose_size
         frames = [posed(frames[0], matrix)]
         bounds = bounds_of(frames[0])
+    elif own_camera is None:
+        seen = orbit(bounds, shape, *view, fov=fov, up=up)
+    else:
+        refuse_beside(f"--camera {camera}", context, ("fov", "up") if environment is None else ("fov",))
+        seen = chosen_camera(loaded, own_camera, model)
+        if isinstance(seen.aspect, float) and not is_given(context, "size"):
+            shape = shape[0], max(round(shape[0] * seen.aspect), 1)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
 

@@ -30,6 +30,12 @@ def view_of(text: str) -> tuple[float, ...]:
     return numbers
 
 
+def file_camera_of(text: str) -> str | None:
+    """The name or number of a file's camera, written as "file:NAME", "" for "file"; None for angles."""
+    kind, _, name = text.partition(":")
+    return name if kind == "file" else None
+
+
 def color_of(text: str) -> tuple[float, ...] | None:
     """The linear colour (3,), 0 to 1, of a colour's name or "#rrggbb"; None for "none", which is transparent."""
     from PIL import ImageColor
@@ -88,6 +94,17 @@ OrbitAngles = Annotated[
         "--camera",
         help="Azimuth,elevation[,distance] about the middle of the object: degrees, and world units. "
         "Without a distance the whole object is in view.",
+    ),
+]
+
+
+ViewOfModel = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        help="Azimuth,elevation[,distance] about the middle of the object: degrees, and world units. "
+        "Without a distance the whole object is in view. Or a camera of a GLB or glTF, which is never taken unasked: "
+        "file for its first, file:NAME or file:NUMBER, from 0 on; without --size the picture then has its ratio.",
     ),
 ]
 

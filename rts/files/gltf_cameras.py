@@ -17,8 +17,10 @@ FAR = 1e13
 """The depth of a far plane that is missing, as a multiple of the near plane's; `Camera` takes it for infinite."""
 
 
-def read_cameras(gltf: Gltf) -> list[Camera]:
-    """The cameras of the scene that is shown, in the order of its nodes, whose scale does not count.
+def read_cameras(gltf: Gltf) -> list[tuple[str, Camera]]:
+    """The cameras of the scene that is shown, in the order of its nodes, whose scale does not count, and their names.
+
+    The name is the node's, else the camera's own, else "".
 
     One without an aspect ratio takes that of the rendered size; one without a far plane has none.
 
@@ -28,15 +30,21 @@ def read_cameras(gltf: Gltf) -> list[Camera]:
     nodes, kinds = gltf.tree.get("nodes", []), gltf.tree.get("cameras", [])
     places = gltf.part("its scene", read_places, gltf) if kinds else []
     return [
-        gltf.part(f"the camera of node {index}", _camera, gltf, kinds, index, place)
+        gltf.part(f"the camera of node {index}", _named_camera, gltf, kinds, index, place)
         for index, place in sorted(places, key=lambda pair: pair[0])
         if "camera" in nodes[index]
     ]
 
 
-def _camera(gltf: Gltf, cameras: list[dict[str, Any]], index: int, place: np.ndarray) -> Camera:
-    """The camera of a node, of index `index` and transform `place` (4, 4)."""
-    camera = cameras[count_of(gltf.tree["nodes"][index]["camera"])]
+def _named_camera(gltf: Gltf, cameras: list[dict[str, Any]], index: int, place: np.ndarray) -> tuple[str, Camera]:
+    """The name and the camera of a node, of index `index` and transform `place` (4, 4)."""
+    node = gltf.tree["nodes"][index]
+    camera = cameras[count_of(node["camera"])]
+    return str(node.get("name") or camera.get("name") or ""), _camera(gltf, camera, index, place)
+
+
+def _camera(gltf: Gltf, camera: dict[str, Any], index: int, place: np.ndarray) -> Camera:
+    """The camera of JSON `camera` of a node, of index `index` and transform `place` (4, 4)."""
     if fault := fault_of(place):
         raise gltf.fail(f"the transform of the camera of node {index} {fault}")
     left, _, right = np.linalg.svd(place[:3, :3])

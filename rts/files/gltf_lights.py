@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from rts.files.gltf_scenes import read_places
-from rts.files.gltf_tree import Gltf, count_of
+from rts.files.gltf_tree import LIGHTS, Gltf, count_of
 from rts.files.model_pieces import fault_of
 
-LIGHTS = "KHR_lights_punctual"
 BRIGHTEST = 1e12
 """Brighter lights are mistakes: the sun, seen from here, has 1e5 lux."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from rts.files.damaged_files import warn
 from rts.files.gltf_accessors import Accessor, read_accessor, read_attributes
 from rts.files.gltf_materials import Material, read_material, unit_colors
-from rts.files.gltf_scenes import read_instances, warn_of_motion
+from rts.files.gltf_scenes import motion_in, read_instances, surroundings_in, warn_of_left_out
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece
 
@@ -32,7 +32,7 @@ def read_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> list[Pie
     """
     gltf = Gltf(path, data, file)
     pieces = [piece for piece, _, _ in read_scene(gltf)[0]]
-    gltf.part("its tree", warn_of_motion, gltf)
+    warn_of_left_out(gltf, gltf.part("its tree", motion_in, gltf) + gltf.part("its scene", surroundings_in, gltf))
     return pieces
 
 

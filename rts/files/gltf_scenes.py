@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.files.damaged_files import Fail, warn
-from rts.files.gltf_tree import TOLD, Gltf, count_of
+from rts.files.gltf_tree import LIGHTS, TOLD, Gltf, count_of
 from rts.files.model_pieces import fault_of
 from rts.scene.clips import node_matrix
 
@@ -110,8 +110,8 @@ def places_of(node: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return translation, rotation, scale
 
 
-def warn_of_motion(gltf: Gltf) -> None:
-    """Warn of skins, morph targets and clips, where they are not read."""
+def motion_in(gltf: Gltf) -> list[str]:
+    """The kinds of what moves in a file: "skins", "morph targets" and "clips"."""
     tree = gltf.tree
     nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
     primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
@@ -120,6 +120,21 @@ def warn_of_motion(gltf: Gltf) -> None:
         "morph targets": any(x.get("targets") for x in primitives) or any(x.get("weights") for x in (*nodes, *meshes)),
         "clips": bool(tree.get("animations")),
     }
-    if any(there.values()):
-        what = " and ".join(name for name, is_there in there.items() if is_there)
+    return [name for name, is_there in there.items() if is_there]
+
+
+def surroundings_in(gltf: Gltf) -> list[str]:
+    """The kinds of what else nodes of the scene that is shown have: "lights" and "cameras"."""
+    nodes = [gltf.tree["nodes"][index] for index, _ in read_places(gltf)]
+    there = {
+        "lights": any(LIGHTS in node.get("extensions", {}) for node in nodes),
+        "cameras": any("camera" in node for node in nodes),
+    }
+    return [name for name, is_there in there.items() if is_there]
+
+
+def warn_of_left_out(gltf: Gltf, kinds: list[str]) -> None:
+    """Warn of kinds of things that are in the file and not read, if there are any."""
+    if kinds:
+        what = " and ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
         warn(f"{gltf.path} has {what}, which are left out; rts.load_model reads them")

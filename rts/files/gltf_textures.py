@@ -92,7 +92,10 @@ def _lookup(gltf: Gltf, reference: dict[str, Any], name: str) -> Lookup:
     texture = gltf.tree["textures"][reference["index"]]
     sampler = gltf.tree["samplers"][count_of(texture["sampler"])] if "sampler" in texture else {}
     across, down = (_named(gltf, sampler, key, WRAPS, "repeat", name) for key in ("wrapS", "wrapT"))
-    filter = _named(gltf, sampler, "magFilter", FILTERS, "linear", name)
+    smaller = FILTERS.get(sampler.get("minFilter", -1))  # None for averages in mipmaps, which are an option of shaders.
+    filter = _named(gltf, sampler, "magFilter", FILTERS, smaller or "linear", name)
+    if smaller not in (None, filter):
+        gltf.note("maps whose minFilter is another than their magFilter, which is taken for both", name)
     return Lookup(texcoord, matrix, across if across == down else (across, down), filter)
 
 

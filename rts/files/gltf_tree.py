@@ -26,6 +26,8 @@ READ = frozenset(
 )
 UNSEEN = re.compile(r"[A-Z]+_(texture|xmp|animation)")
 """Names of extensions begin like this that are read, or that make no difference to what is loaded."""
+LIGHTS = "KHR_lights_punctual"
+"""The extension of lights."""
 TOLD = "EXT_mesh_gpu_instancing"
 """An extension of which reading scenes warns."""
 PROPERTIES = {

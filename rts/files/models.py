@@ -50,7 +50,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent. Heights
     of `map_Bump` become "normal_map", and so does a picture there that has the colours of a normal map.
 
-    Parts of a glTF are at rest: joints, morph targets and clips are left out, and `rts.load_model` reads them.
+    Parts of a glTF are at rest: joints, morph targets, clips, lights and cameras are left out, with a warning, and
+    `rts.load_model` reads them.
 
     Welding may make vertices fewer than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.
@@ -90,12 +91,28 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         check_exists(path)
         return [part.replace(cull="back") if cull == "back" else part for part in plugin.load(path)]
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
-        pieces = [linear(piece) for piece in read_pieces(path)]
-        if merge and (len(pieces) > 1 or pieces[0].transform is not None):
-            pieces = [_merged(path, pieces)]
-        parts = [part_of(path, piece, weld).replace(cull=cull_of(piece, cull)) for piece in pieces]
+        parts = parts_of(path, read_pieces(path), merge, weld, cull)
     warn_once(path, notes)
     return parts
+
+
+def parts_of(path: Path, pieces: list[Piece], merge: bool = False, weld: bool = True, cull: str = "none") -> list[Part]:
+    """The parts of the meshes among pieces, which are checked; `merge`, `weld` and `cull` as of `load`.
+
+    Raises:
+        InputError: there is no mesh with faces, or one is damaged; or pieces cannot be merged.
+    """
+    meshes = [piece for piece in pieces if len(piece.faces)]
+    if not meshes:
+        points = sum(len(piece.vertices) for piece in pieces)
+        what = f"{points} points but no faces" if points else "no geometry"
+        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
+    for piece in meshes:
+        check_piece(path, piece)
+    meshes = [linear(piece) for piece in meshes]
+    if merge and (len(meshes) > 1 or meshes[0].transform is not None):
+        meshes = [_merged(path, meshes)]
+    return [part_of(path, piece, weld).replace(cull=cull_of(piece, cull)) for piece in meshes]
 
 
 def linear(piece: Piece) -> Piece:
@@ -266,33 +283,21 @@ def check_exists(path: Path) -> None:
 
 
 def read_pieces(path: Path) -> list[Piece]:
-    """The meshes of a file, at least one, each with at least one face; indices and values are checked.
-
-    Raises:
-        InputError: the file cannot be read, or holds no sound mesh.
-    """
+    """The pieces of a file; an InputError where it cannot be read."""
     check_exists(path)
     extension = path.suffix.lower().removeprefix(".")
     data = b"" if extension == "obj" else contents(path)
     file = functools.partial(beside, path)
     match extension:
         case "obj":
-            pieces = read_obj(path)
+            return read_obj(path)
         case "ply":
-            pieces = [read_ply(path, data, file)]
+            return [read_ply(path, data, file)]
         case "off":
-            pieces = [read_off(path, data)]
+            return [read_off(path, data)]
         case "stl" | "stl_ascii":
-            pieces = read_stl(path, data)
+            return read_stl(path, data)
         case "glb" | "gltf":
-            pieces = read_gltf(path, data, file)
+            return read_gltf(path, data, file)
         case _:
-            pieces = read_with_trimesh(path, data, file)
-    meshes = [piece for piece in pieces if len(piece.faces)]
-    if not meshes:
-        points = sum(len(piece.vertices) for piece in pieces)
-        what = f"{points} points but no faces" if points else "no geometry"
-        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
-    for piece in meshes:
-        check_piece(path, piece)
-    return meshes
+            return read_with_trimesh(path, data, file)

@@ -72,6 +72,7 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
             bindings.append(Binding(node, skin if is_bent else None))
         if not parts:
             raise InputError(f"{path} holds no faces; expected a mesh with triangles")
+        cameras = read_cameras(gltf)
         model = Model(
             tuple(parts),
             tuple(bindings),
@@ -79,7 +80,8 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
             tuple(skins),
             tuple(read_clips(gltf, accessors, nodes)),
             read_lights(gltf),
-            tuple(read_cameras(gltf)),
+            tuple(camera for _, camera in cameras),
+            tuple(name for name, _ in cameras),
         )
         gltf.warn_of_notes()
     warn_once(path, notes)

@@ -91,6 +91,7 @@ class Model:
         clips: its clips.
         lights: θ["light"] of its directional and point lights, at rest; empty if there are none.
         cameras: its cameras, at rest, in the order of their nodes.
+        camera_names: the name of each: its node's, else its own, else "".
     """
 
     parts: tuple[Part, ...]
@@ -100,6 +101,7 @@ class Model:
     clips: tuple[Clip, ...]
     lights: dict[str, np.ndarray]
     cameras: tuple[Camera, ...]
+    camera_names: tuple[str, ...] = ()
 
     def clip(self, clip: str | int) -> Clip:
         """The clip of a name, or of an index.

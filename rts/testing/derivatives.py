@@ -105,7 +105,7 @@ def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str
     product = float(np.sum(gradient * along))
     scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-3)
     claim(
-        abs(product - slope) <= 2e-3 * scale,
+        abs(product - slope) <= 1e-3 * scale,
         f"{what} is {product:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",
     )
 

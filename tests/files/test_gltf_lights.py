@@ -1,5 +1,6 @@
 """Lights and cameras of glTF."""
 
+import base64
 import json
 
 import numpy as np
@@ -95,15 +96,16 @@ def test_cameras_are_those_of_rts(tmp_path):
     cameras = [
         {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "zfar": 50, "aspectRatio": 1.5}},
         {"type": "orthographic", "orthographic": {"xmag": 3, "ymag": 2, "znear": 0.1, "zfar": 10}},
-        {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1}},
+        {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1}, "name": "lens"},
     ]
     nodes = [
         {"camera": 0, "translation": [1, 2, 3]},
         {"children": [2], "scale": [2, 4, 2], "translation": [0, 5, 0]},
-        {"camera": 1, "rotation": QUARTER_ABOUT_X},
+        {"camera": 1, "rotation": QUARTER_ABOUT_X, "name": "front"},
         {"camera": 2, "translation": [1, 2, 3]},
     ]
-    found = read_cameras(opened(tmp_path, cameras=cameras, nodes=nodes))
+    names, found = zip(*read_cameras(opened(tmp_path, cameras=cameras, nodes=nodes)), strict=True)
+    assert names == ("", "front", "lens")
     fov = np.degrees(0.8)
     expected = [
         rts.Camera.look_at((1, 2, 3), (1, 2, 0), fov_y=fov, aspect=1.5, near=0.1, far=50),
@@ -129,3 +131,57 @@ def test_cameras_are_those_of_rts(tmp_path):
 def test_wrong_cameras_are_refused(tmp_path, camera, message):
     with pytest.raises(rts.InputError, match=message):
         read_cameras(opened(tmp_path, cameras=[camera], nodes=[{"camera": 0}]))
+
+
+# ---------------------------------------------------------------------------------------------- what is left out
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
+SEEN = {"perspective": {"yfov": 0.8, "znear": 0.1}, "type": "perspective"}
+
+
+def of_a_triangle(folder, *nodes, shown=None, **tree):
+    """The path of a glTF of a triangle, node 0, and further nodes; the scene has all of them, or those `shown`."""
+    tree = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": "data:;base64," + base64.b64encode(CORNERS).decode(), "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}, *nodes],
+        "scenes": [{"nodes": list(range(1 + len(nodes))) if shown is None else shown}],
+        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "point"}]}},
+        "cameras": [SEEN],
+        **tree,
+    }
+    (folder / "m.gltf").write_text(json.dumps(tree))
+    return folder / "m.gltf"
+
+
+LIT = {"extensions": {"KHR_lights_punctual": {"light": 0}}}
+CLIPS = {"animations": [{"channels": [], "samplers": []}]}
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tree", "kinds"),
+    [
+        ([LIT], {}, "lights"),
+        ([{"camera": 0}], {}, "cameras"),
+        ([LIT, {"camera": 0}], {}, "lights and cameras"),
+        ([{"camera": 0}, LIT], CLIPS, "clips, lights and cameras"),
+    ],
+)
+def test_load_names_lights_and_cameras_that_it_leaves_out_and_load_model_reads_them(tmp_path, nodes, tree, kinds):
+    path = of_a_triangle(tmp_path, *nodes, **tree)
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        rts.load(path)
+    what = f"{path} has {kinds}, which are left out; rts.load_model reads them"
+    assert [str(warning.message) for warning in caught] == [what]
+    model = rts.load_model(path)
+    assert bool(model.lights) == ("lights" in kinds) and len(model.cameras) == ("cameras" in kinds)
+
+
+def test_lights_and_cameras_of_no_node_that_is_shown_are_not_told_of(tmp_path):
+    rts.load(of_a_triangle(tmp_path))
+    path = of_a_triangle(tmp_path, LIT, {"camera": 0}, shown=[0])
+    rts.load(path)
+    assert rts.load_model(path).lights == {} and rts.load_model(path).cameras == ()

@@ -225,12 +225,27 @@ def test_what_is_not_followed_is_one_warning_that_names_it(tmp_path):
         ({}, "repeat", "linear"),
         ({"wrapS": 33071, "wrapT": 33071, "magFilter": 9728}, "clamp", "nearest"),
         ({"wrapT": 33648, "magFilter": 9729, "minFilter": 9984}, ("repeat", "mirror"), "linear"),
+        ({"minFilter": 9728}, "repeat", "nearest"),
+        ({"minFilter": 9987}, "repeat", "linear"),
+        ({"magFilter": 9728, "minFilter": 9728}, "repeat", "nearest"),
     ],
 )
 def test_samplers_are_options_of_the_shader(tmp_path, sampler, wrap, filter):
     look = {"baseColorTexture": {"index": 0}}
     [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": look}, [GREY], more={"samplers": [sampler]}))
-    assert (part.shader.wrap, part.shader.filter) == (wrap, filter)
+    assert (part.shader.wrap, part.shader.filter, part.shader.mip) == (wrap, filter, False)
+
+
+@pytest.mark.parametrize(("smaller", "larger", "filter"), [(9728, 9729, "linear"), (9729, 9728, "nearest")])
+def test_one_filter_is_taken_where_a_sampler_has_two_and_the_warning_says_so(tmp_path, smaller, larger, filter):
+    samplers = {"samplers": [{"magFilter": larger, "minFilter": smaller}]}
+    path = model(tmp_path, {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, [GREY], more=samplers)
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        [part] = rts.load(path)
+    assert part.shader.filter == filter and [str(warning.message) for warning in caught] == [
+        f"{path} has maps whose minFilter is another than their magFilter, which is taken for both: the texture of "
+        "material 0"
+    ]
 
 
 @pytest.mark.parametrize(

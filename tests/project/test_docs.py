@@ -31,7 +31,11 @@ ELSEWHERE = {
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
-    "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 -o picture.png": "test_cli.py",
+    "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 --background white -o picture.png": (
+        "test_cli.py"
+    ),
+    "rts render scene.glb --camera file -o scene.png": "test_own_light_and_view.py",
+    "rts render scene.glb --camera file --exposure -2 -o scene.png": "test_own_light_and_view.py",
     "rts render man.glb --clip walk --time 0.4 -o man.png": "test_cli.py",
     "rts render man.glb --clip 0 -o man.gif": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
