@@ -44,9 +44,10 @@ class NumpyEngine(Engine):
         Beside float64, float32 is widened, as NumPy does.
         """
         if not operation.fits(list(map(_DTYPE, operands))):
-            operands = [x.astype(np.float64) if x.dtype == np.float32 else x for x in operands]
-            if not operation.fits(list(map(_DTYPE, operands))):
+            widened = [x.astype(np.float64) if x.dtype == np.float32 else x for x in operands]
+            if not operation.fits(list(map(_DTYPE, widened))):
                 return operation.specification(*operands, **params)
+            operands = widened
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 
     def on_host(self, *arrays: np.ndarray) -> bool:

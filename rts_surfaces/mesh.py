@@ -17,7 +17,7 @@ from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
-from rts_surfaces.smooth_normals import smooth_normals, vertex_normals
+from rts_surfaces.smooth_normals import smooth_normals, table_of, vertex_normals
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangents")
 
@@ -171,7 +171,7 @@ class Mesh(TriangleSurface):
         Those of NumPy vertices are kept until the vertices change.
         """
         if exemplar(vertices) is not None:
-            return vertex_normals(vertices, engine_of(vertices).constant(self.faces, vertices))
+            return vertex_normals(vertices, table_of(self.faces, vertices))
         key, kept = fingerprint(vertices), self._normals
         if kept is None or kept[0] != key:
             kept = self._normals = (key, vertex_normals(vertices, self.faces))

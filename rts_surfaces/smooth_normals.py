@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rts import engine_of, namespace
+from rts import InputError, engine_of, namespace
 from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, filled_up, interpolate, take
 
@@ -20,12 +20,16 @@ def smooth_normals(vertices: Array, params: Array, ids: Array, faces: np.ndarray
         ids: (N, I) integers; the first three are the triangle's vertices.
         faces: (T, 3) integers, all triangles.
     """
-    engine, xp = engine_of(vertices), namespace(vertices, params)
+    xp = namespace(vertices, params)
     if xp.finfo(params.dtype).bits < xp.finfo(vertices.dtype).bits:
         params = xp.astype(params, vertices.dtype)
-    # Further faces are points, and add nothing.
-    table = filled_up(faces, engine.room(len(faces), vertices))
-    return SMOOTH_NORMALS(vertices, params, ids, engine.constant(table, vertices))
+    return SMOOTH_NORMALS(vertices, params, ids, table_of(faces, vertices))
+
+
+def table_of(faces: np.ndarray, vertices: Array) -> Array:
+    """Faces (T, 3) as an array of the engine of `vertices`, with room: further faces are points, and add nothing."""
+    engine = engine_of(vertices)
+    return engine.constant(filled_up(faces, engine.room(len(faces), vertices)), vertices)
 
 
 def vertex_normals(vertices: Array, faces: Array) -> Array:
@@ -39,6 +43,19 @@ def vertex_normals(vertices: Array, faces: Array) -> Array:
 
 def _specification(vertices: Array, params: Array, ids: Array, faces: Array) -> Array:
     return interpolate(vertex_normals(vertices, faces), ids, 0, params)
+
+
+def _check(vertices: np.ndarray, params: np.ndarray, ids: np.ndarray, faces: np.ndarray, **_: object) -> None:
+    if (
+        not vertices.shape[1] == faces.shape[1] == 3
+        or ids.shape[1] < 3
+        or params.shape[1] < 2
+        or len(ids) != len(params)
+    ):
+        shapes = ", ".join(str(x.shape) for x in (vertices, params, ids, faces))
+        raise InputError(
+            f"vertices, params, ids and faces have shapes {shapes}; expected (V, 3), (N, 2), (N, 3), (T, 3)"
+        )
 
 
 def _shape(vertices: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
@@ -57,6 +74,7 @@ SMOOTH_NORMALS = Operation.of_loops(
     (2, 2, 2, 2),
     _shape,
     _loops,
+    _check,
     differentiable=2,
     packed=(1, 2),
     packed_result=True,

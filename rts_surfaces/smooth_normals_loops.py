@@ -172,8 +172,10 @@ def _add_moved(vertices, t_vertices, faces, row_of, sums):
 def _normalize(unit, length):
     """Scale rows of `unit` (U, 3) to length one, and fill `length` (U,) with what they were, or 1 for zeros."""
     for r in range(len(unit)):
-        size = np.sqrt(unit[r, 0] ** 2 + unit[r, 1] ** 2 + unit[r, 2] ** 2)
-        length[r] = size if size > 0 else 1.0
+        largest = max(abs(unit[r, 0]), abs(unit[r, 1]), abs(unit[r, 2]))  # Squares of it may be too small or large.
+        scale = largest if largest > 0 else 1.0
+        size = np.sqrt((unit[r, 0] / scale) ** 2 + (unit[r, 1] / scale) ** 2 + (unit[r, 2] / scale) ** 2)
+        length[r] = size * scale if size > 0 else 1.0
         for i in range(3):
             unit[r, i] /= length[r]
 

@@ -107,7 +107,7 @@ ORDER = {
     ("to the device", "samples"): ("ids", "barycentrics", "row", "depth", "triangle"),
     ("to the device", "_found_on_host"): (*_OF_BREAKS, "pulls", "joined", "ids of breaks", "barycentrics of breaks"),
     ("to the host", "_found_on_host"): ("vertices", "row", "depth", "triangle"),
-    ("to the device", "_vertex_normals"): ("faces",),
+    ("to the device", "table_of"): ("faces",),
 }
 """The arrays that cross in a call, in their order, numbers and matrices left out."""
 OF_OPERATIONS = {

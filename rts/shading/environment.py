@@ -129,7 +129,8 @@ def _bilinear(
     # What is no number names some texel, and stays none by its shares.
     left, top = (xp.where(x == x, x, 0.0) for x in (xp.floor(stop(column)), xp.floor(stop(row))))
     right, down = (column - left)[:, None], (row - top)[:, None]
-    columns = [x - xp.floor(x / width) * width for x in (left, left + 1)]
+    # Compilers divide by way of reciprocals, whose rounding would lead out of the row.
+    columns = [xp.where(x < 0, x + width, xp.where(x >= width, x - width, x)) for x in (left, left + 1)]
     rows = [xp.clip(xp.clip(x, 0.0, None), None, height - 1) for x in (top, top + 1)]
 
     index = [xp.astype(y * width + x, xp.int32) + start for y in rows for x in columns]

@@ -73,6 +73,8 @@ class TorchEngine(Engine):
         if kept is None or kept[0]() is not array:
             with torch.inference_mode(False):  # Gradients may need it later.
                 sent = to_tensor(array, device)
+            if type(sent) is not torch.Tensor and device.type == "cpu":  # Without values, as in FakeTensorMode.
+                return sent
             kept = _sent[key] = weakref.ref(array, lambda _: _sent.pop(key, None)), sent
         return kept[1]
 

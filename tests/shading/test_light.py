@@ -127,3 +127,12 @@ def test_tone_mapping_keeps_dark_colours_and_compresses_bright_ones():
     np.testing.assert_allclose(half, [[*(0.5 * tonemap(np.array([2.0, 1.0, 0.4]))), 0.5], [0, 0, 0, 0]])
     with pytest.raises(InputError, match="expected a number of stops"):
         tonemap(grey, "bright")
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("width", [41, 47, 82])
+def test_environments_of_odd_widths_are_looked_up_inside_of_their_rows(target, width):
+    image = arrays(target, np.ones((width // 2, width, 3)))
+    for name, found in prefiltered(image).items():
+        assert np.isfinite(to_numpy(found)).all(), name
+    np.testing.assert_allclose(to_numpy(turned_environment(image, arrays(target, np.eye(3)))), 1, atol=1e-6)

@@ -57,13 +57,34 @@ def test_a_sheet_that_turns_takes_its_normals_along(target):
 
 
 def test_vertices_without_area_have_none_and_its_derivative_is_that_of_the_sum():
-    vertices, params, ids = np.zeros((3, 3)), np.array([(0.2, 0.3)]), np.array([(0, 1, 2)], np.int32)
-    operands = [read_only(x) for x in (vertices, params, ids, ids)]
+    # The sum around each corner is (b − a) × (c − a), which grows by 3 z for a motion of c along y.
+    vertices, params, ids = np.array([(0.0, 0, 0), (3, 0, 0), (5, 0, 0)]), np.array([(0.2, 0.3)]), [(0, 1, 2)]
+    operands = [read_only(x) for x in (vertices, params, np.array(ids, np.int32), np.array(ids, np.int32))]
     found, kept = SMOOTH_NORMALS.value_on_host(operands, {})
     np.testing.assert_array_equal(found, 0)
     pulled = np.zeros_like(vertices)
-    SMOOTH_NORMALS.pull_on_host(operands, np.ones((1, 3)), (pulled, None), kept, {})
-    assert np.isfinite(pulled).all()
+    SMOOTH_NORMALS.pull_on_host(operands, np.array([(0.0, 0, 1)]), (pulled, None), kept, {})
+    np.testing.assert_allclose(pulled[2], (0, 3, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-85, 1e80])
+def test_float64_of_any_size_has_normals(size):
+    vertices = size * np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    ids = np.array([(0, 1, 2)], np.int32)
+    np.testing.assert_allclose(smooth_normals(vertices, np.array([(0.2, 0.3)]), ids, ids), [(0, 0, 1)], atol=1e-12)
+
+
+def test_operands_of_wrong_shapes_are_refused():
+    params, ids = some_samples()
+    for wrong in (
+        (BALL, params[:, :1], ids),
+        (BALL, params[:9], ids),
+        (BALL, params, ids[:, :2]),
+        (BALL[:, :2], params, ids),
+    ):
+        operands = [read_only(x, np.float64 if x.dtype.kind == "f" else None) for x in (*wrong, FACES)]
+        with pytest.raises(InputError, match="expected \\(V, 3\\), \\(N, 2\\)"):
+            SMOOTH_NORMALS.value_on_host(operands, {})
 
 
 def test_vertices_that_no_sample_names_have_no_row():
