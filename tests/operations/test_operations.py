@@ -275,6 +275,23 @@ def test_operations_of_one_name_do_not_take_each_other_s_place():
     np.testing.assert_allclose(two, 2 * one, rtol=1e-6)
 
 
+# ----------------------------------------------------------------------------------------------------- unit vectors
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_unit_vectors_of_any_length_and_the_derivative_of_zero(dtype):
+    direction = np.array([0.6, 0, 0.8])
+    sizes = {np.float32: (1e-40, 1e-30, 1.0, 1e30), np.float64: (1e-300, 1e-150, 1.0, 1e150, 1e300)}[dtype]
+    vectors = np.array([size * direction for size in sizes]).astype(dtype)
+    rtol = 1e-4 if dtype is np.float32 else 1e-12  # Of the least float32 numbers few digits are left.
+    np.testing.assert_allclose(unit(vectors), np.tile(direction, (len(sizes), 1)), rtol=rtol)
+    zero, g, found = np.zeros((1, 3), dtype), np.array([(1.0, 2.0, 3.0)], dtype), np.full((1, 3), np.nan, dtype)
+    np.testing.assert_array_equal(unit(zero), zero)
+    UNIT.pull_on_host([zero], g, [found], None, {})
+    np.testing.assert_array_equal(found, g)
+    assert np.isnan(unit(np.array([(np.nan, 1, 1)], dtype))).all()
+
+
 # ------------------------------------------------------------------------------------------- all of them, by the kit
 
 
@@ -321,20 +338,6 @@ class TestEachOperation(OperationConformance):
 
 
 # ------------------------------------------------------------------------------------- gradients of functions of points
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_unit_vectors_of_any_length_and_the_derivative_of_zero(dtype):
-    direction = np.array([0.6, 0, 0.8])
-    sizes = {np.float32: (1e-40, 1e-30, 1.0, 1e30), np.float64: (1e-300, 1e-150, 1.0, 1e150, 1e300)}[dtype]
-    vectors = np.array([size * direction for size in sizes]).astype(dtype)
-    rtol = 1e-4 if dtype is np.float32 else 1e-12  # Of the least float32 numbers few digits are left.
-    np.testing.assert_allclose(unit(vectors), np.tile(direction, (len(sizes), 1)), rtol=rtol)
-    zero, g, found = np.zeros((1, 3), dtype), np.array([(1.0, 2.0, 3.0)], dtype), np.full((1, 3), np.nan, dtype)
-    np.testing.assert_array_equal(unit(zero), zero)
-    UNIT.pull_on_host([zero], g, [found], None, {})
-    np.testing.assert_array_equal(found, g)
-    assert np.isnan(unit(np.array([(np.nan, 1, 1)], dtype))).all()
 
 
 @pytest.mark.parametrize("target", ALL)
