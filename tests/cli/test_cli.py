@@ -18,6 +18,7 @@ from rts.cli import demo, tried_versions
 from rts.cli import main as cli
 from rts.cli import pose_fit as pose
 from rts.errors import InputError, PluginError
+from rts.files import lit_models
 from rts.scene.default_camera import Bounds, bounds_of, orbit
 
 pytestmark = pytest.mark.files
@@ -126,7 +127,7 @@ def test_what_a_file_says_cannot_command_the_terminal(tmp_path):
 
 def test_each_warning_is_shown_once_and_in_one_line_whoever_warns(tmp_path, monkeypatch):
     (tmp_path / "m.obj").write_text(f"{QUAD}f 1 2 3 4\n")
-    load = rts.load
+    load = lit_models.load
 
     def warning(path, **options):
         for number in (1, 2, 1, 2):
@@ -134,7 +135,7 @@ def test_each_warning_is_shown_once_and_in_one_line_whoever_warns(tmp_path, monk
         np.float32(1e30) * np.float32(1e30)
         return load(path)
 
-    monkeypatch.setattr(rts, "load", warning)
+    monkeypatch.setattr(lit_models, "load", warning)
     before = warnings.showwarning
     result = run("render", tmp_path / "m.obj", "-o", tmp_path / "a.png", "--size", 8)
     assert result.exit_code == 0 and warnings.showwarning is before
@@ -423,7 +424,8 @@ def test_names_that_cannot_be_written_are_refused_before_any_work(model, tmp_pat
     def work(*_, **__):
         raise AssertionError
 
-    for name in ("rts.render", "rts.load", "rts.cli.pose_fit.fit_pose", "rts.cli.demo.fit_pose"):
+    readers, fits = ("rts.load", "rts.files.lit_models.load"), ("rts.cli.pose_fit.fit_pose", "rts.cli.demo.fit_pose")
+    for name in ("rts.render", *readers, *fits):
         monkeypatch.setattr(name, work)
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.png").mkdir()
