@@ -43,14 +43,29 @@ def tangents(
     """
     check_two_parameters(surface, samples, TANGENT, "normal maps")
     params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer["uv"]))
-    xp, beside = namespace(position), replace(samples, params=params)
-    moves, changes = zip(*steps_beside(surface, theta, beside, position, uv), strict=True)
-    (au, av), (bu, bv) = ((change[:, :1], change[:, 1:2]) for change in changes)
+    beside = steps_beside(surface, theta, replace(samples, params=params), position, uv)
+    return tangent_along(gbuffer["normal"], *beside)
+
+
+def tangent_along(normal: Array, first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
+    """The G-buffer's "tangent" of a surface whose derivatives are known, differentiable; see `rts.GBuffer`.
+
+    Args:
+        normal: (N, 3), outward, of any length.
+        first: derivatives of position (N, 3) and uv (N, 2) along one parameter of the surface.
+        second: likewise along another one.
+
+    Returns:
+        (N, 4): the unit direction in which u grows and v stays, and the sign of the bitangent. The direction is zero
+        where uv does not change.
+    """
+    xp, (a, da), (b, db) = namespace(normal), first, second
+    (au, av), (bu, bv) = ((change[:, :1], change[:, 1:2]) for change in (da, db))
     mirrored = au * bv - av * bu < 0
-    along_u, along_v = moves[0] * bv - moves[1] * av, moves[1] * au - moves[0] * bu
+    along_u, along_v = a * bv - b * av, b * au - a * bu
     along_u = xp.where(mirrored, -along_u, along_u)
-    turns_left = dot(xp.linalg.cross(gbuffer["normal"], along_u), xp.where(mirrored, -along_v, along_v)) >= 0
-    one = xp.ones_like(position[:, :1])
+    turns_left = dot(xp.linalg.cross(normal, along_u), xp.where(mirrored, -along_v, along_v)) >= 0
+    one = xp.ones_like(normal[:, :1])
     return xp.concat([unit(along_u), xp.where(turns_left, one, -one)], axis=1)
 
 

@@ -38,6 +38,13 @@ def normals(rows: Array, table: Array, patch: Array, params: Array) -> Array:
     return NORMALS(rows, params, patch, table)
 
 
+def slopes(rows: Array, table: Array, patch: Array, params: Array) -> tuple[Array, Array]:
+    """Derivatives (N, C) along u, and along v; arguments as for `values`."""
+    ids = namespace(table, patch).take(table, patch, axis=0)
+    (a, da), (b, db) = (_bernstein(params[:, i]) for i in range(2))
+    return _sum(rows, ids, da, b), _sum(rows, ids, a, db)
+
+
 def _bernstein(t: Array) -> tuple[Array, Array]:
     """The four cubic Bernstein polynomials (N, 4) at (N,), and their derivatives."""
     xp, s = namespace(t), 1 - t

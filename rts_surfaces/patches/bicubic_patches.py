@@ -12,8 +12,9 @@ from rts import GBuffer, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants
 from rts.plugin_api.records import Rays, Samples
 from rts.plugin_api.threads import parallel, read_only
+from rts.shading import tangent_along
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, WIDTHS, check_entry
-from rts_surfaces.patches.bicubic import normals, values
+from rts_surfaces.patches.bicubic import normals, slopes, values
 from rts_surfaces.patches.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.patches.tiles import Tiles
 
@@ -133,6 +134,9 @@ class Patches(Parametric):
         for name in ATTRIBUTES:
             if name in theta:
                 gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self._attribute, theta[name], where))
+        if "uv" in theta:
+            derivatives = lambda: zip(slopes(rows, *where), slopes(self.bezier_rows(theta["uv"]), *where), strict=True)
+            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *derivatives()))
         return gbuffer
 
     def _attribute(self, attribute: Array, where: tuple[Array, Array, Array]) -> Array:

@@ -179,15 +179,15 @@ class Limit:
         return out
 
     def derivative_stencils(
-        self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64
+        self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64, channel: int = VERTEX
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (N, W) of vertices for the derivatives of points along u, and along v; see `stencils`.
+        """Weights (N, W) for the derivatives along u, and along v; see `stencils`.
 
         At points whose derivatives are parallel for any control points, as at the corner of a sheet with a smooth
         boundary, the weights are those of a point beside.
         """
-        along_u, along_v = np.empty((2, len(faces), self._width(VERTEX)), dtype)
-        self._stencils(faces, params, VERTEX, None, along_u, along_v)
+        along_u, along_v = np.empty((2, len(faces), self._width(channel)), dtype)
+        self._stencils(faces, params, channel, None, along_u, along_v)
         return along_u, along_v
 
     def _width(self, channel: int) -> int:

@@ -20,6 +20,7 @@ from rts.plugin_api.checks import fingerprint, quoted
 from rts.plugin_api.operations import combine, filled_up, take, with_room
 from rts.plugin_api.records import ArraySpec, Rays, Samples
 from rts.plugin_api.threads import read_only
+from rts.shading import tangent_along
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.patches.parametric import (
     BEYOND,
@@ -249,19 +250,22 @@ class Subdivision(Parametric):
         (weights,) = at(VERTEX, False)
         gbuffer = GBuffer(position=combine(vertices, ids, weights))
 
-        def normal() -> Array:
-            along_u, along_v = (combine(vertices, ids, w) for w in at(VERTEX, True))
-            return unit(engine.namespace.linalg.cross(along_u, along_v))
+        def slopes() -> tuple[Array, Array]:
+            return tuple(combine(vertices, ids, w) for w in at(VERTEX, True))
 
-        def varying() -> Array:
-            (uv_weights,) = at(UV, False)
-            return combine(theta["uv"], ids_of(self.limit.uv_table), uv_weights)
+        def uv(derivatives: bool) -> tuple[Array, ...]:
+            varies = self._uv is not None
+            rows = ids_of(self.limit.uv_table) if varies else ids
+            return tuple(combine(theta["uv"], rows, w) for w in at(UV if varies else VERTEX, derivatives))
 
-        gbuffer.defer("normal", normal)
+        gbuffer.defer("normal", lambda: unit(engine.namespace.linalg.cross(*slopes())))
+        if "uv" in theta:
+            along = lambda: zip(slopes(), uv(True), strict=True)
+            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *along()))
         for name in self.reads(theta)[1:]:
             entry = G_BUFFER_NAMES.get(name, name)
             if name == "uv" and self._uv is not None:
-                gbuffer.defer(entry, varying)
+                gbuffer.defer(entry, lambda: uv(False)[0])
             else:
                 gbuffer.defer(entry, partial(combine, theta[name], ids, weights))
         return gbuffer
@@ -279,7 +283,7 @@ class Subdivision(Parametric):
 
         def host(faces: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, ...]:
             if derivatives:
-                return self.limit.derivative_stencils(faces, params, dtype)
+                return self.limit.derivative_stencils(faces, params, dtype, channel)
             return (self.limit.stencils(faces, params, dtype, channel),)
 
         return engine.call_host(host, [spec] * (1 + derivatives), faces, params)
