@@ -11,17 +11,19 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputWarning, warn
+from rts.shading.pbr import MAPS
 from rts.shading.tangents import TANGENT
+from rts.shading.textures import own_uv
 from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = (
-    *("color", "texture", "light", "specular", "shininess", "depth_range", "weights"),
-    *("metallic", "roughness", "normal_map", "occlusion", "emissive"),
+    *("color", "texture", "light", "shininess", "depth_range", "weights"),
+    *MAPS,
 )
 """Names that built-in surfaces and shaders read. They cause no warning: files hold them for any shader."""
 
-ATTRIBUTES = ("position", "normal", "uv", TANGENT, FOOTPRINT)
+ATTRIBUTES = ("position", "normal", "uv", TANGENT, FOOTPRINT, *map(own_uv, MAPS))
 """Names that are attributes of the G-buffer only; "color" may be an entry of θ, too."""
 
 ALIKE = 0.8

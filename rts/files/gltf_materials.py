@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +34,8 @@ class Material(NamedTuple):
         cutoff: the least alpha that is shown, of "MASK".
         entries: entries of θ for the shader `pbr`, linear: "metallic", "roughness", "normal_map", "occlusion",
             "emissive" and "specular", numbers or maps; None where the material tells nothing but its base colour.
-        lookup: the way in which all maps are looked up.
+        lookup: the way in which the texture is looked up, and most maps.
+        lookups: entry of θ → the way in which its map is looked up, where it is another one.
         unlit: True if it has no light.
         double_sided: False if it is not seen from behind.
     """
@@ -43,6 +46,7 @@ class Material(NamedTuple):
     cutoff: float = 0.5
     entries: dict[str, np.ndarray] | None = None
     lookup: Lookup = Lookup()
+    lookups: Mapping[str, Lookup] = MappingProxyType({})
     unlit: bool = False
     double_sided: bool = False
 
@@ -82,7 +86,7 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
     if factor.shape != (4,):
         raise gltf.fail(f"the baseColorFactor of {name} is {factor.tolist()}; expected four numbers")
     color = unit_colors(gltf, f"baseColorFactor of {name}", factor[None])[0] if "baseColorFactor" in look else None
-    texture = maps.read(look, "baseColorTexture", f"the texture of {name}")
+    texture = maps.read(look, "baseColorTexture", f"the texture of {name}", "texture")
     if older:
         gltf.note(f"{OLDER}, of which the diffuse colour alone is read", name)
     unlit = UNLIT in material.get("extensions", {})
@@ -93,7 +97,8 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
         alpha_mode=material.get("alphaMode", "OPAQUE"),
         cutoff=float(material.get("alphaCutoff", 0.5)),
         entries=entries,
-        lookup=maps.lookup or Lookup(),
+        lookup=maps.lookup,
+        lookups={entry: way for entry, way in maps.lookups.items() if way != maps.lookup},
         unlit=unlit,
         double_sided=bool(material.get("doubleSided", False)),
     )
@@ -106,16 +111,18 @@ def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: s
     shine = material.get("extensions", {}).get(SPECULAR)
     if not keys and shine is None:
         return None
-    surface = maps.read(look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}")
+    surface = maps.read(
+        look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}", "metallic", "roughness"
+    )
     entries = {}
     for entry, key, channel in (("metallic", "metallicFactor", 2), ("roughness", "roughnessFactor", 1)):
         factor = _number(gltf, look, key, 1.0, name, most=1.0)
         entries[entry] = np.asarray(factor if surface is None else factor * surface[..., channel : channel + 1])
-    bumps = maps.read(material, "normalTexture", f"the normalTexture of {name}")
+    bumps = maps.read(material, "normalTexture", f"the normalTexture of {name}", "normal_map")
     if bumps is not None:
         scale = _number(gltf, material["normalTexture"], "scale", 1.0, name, least=-LARGEST)
         entries["normal_map"] = (2 * bumps[..., :3] - 1) * [scale, scale, 1.0]
-    open_ = maps.read(material, "occlusionTexture", f"the occlusionTexture of {name}")
+    open_ = maps.read(material, "occlusionTexture", f"the occlusionTexture of {name}", "occlusion")
     if open_ is not None:
         strength = _number(gltf, material["occlusionTexture"], "strength", 1.0, name, most=1.0)
         entries["occlusion"] = 1 + strength * (open_[..., :1] - 1)
@@ -125,7 +132,7 @@ def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: s
         raise gltf.fail(f"the emissiveFactor of {name} is {factor.tolist()}; expected three numbers from 0 to 1")
     factor = factor * _number(gltf, strong, "emissiveStrength", 1.0, name)
     if factor.any():
-        glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}", srgb=True)
+        glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}", "emissive")
         entries["emissive"] = factor if glow is None else factor * decode_srgb(glow[..., :3])
     if shine is not None:
         entries["specular"] = _specular(maps, shine, name)
@@ -141,16 +148,23 @@ def _specular(maps: Maps, shine: dict[str, Any], name: str) -> np.ndarray:
     color = np.array(shine.get("specularColorFactor", [1.0] * 3), np.float64)
     if color.shape != (3,) or not ((color >= 0) & (color <= LARGEST)).all():
         raise gltf.fail(f"the specularColorFactor of {name} is {color.tolist()}; expected three numbers from 0 on")
-    tint = maps.read(shine, "specularColorTexture", f"the specularColorTexture of {name}", srgb=True)
-    strength = maps.read(shine, "specularTexture", f"the specularTexture of {name}")
+    tint = maps.read(shine, "specularColorTexture", f"the specularColorTexture of {name}", "specular")
+    of_tint = maps.lookups.get("specular")
+    strength = maps.read(shine, "specularTexture", f"the specularTexture of {name}", "specular")
     product = color * _number(gltf, shine, "specularFactor", 1.0, name, most=1.0)
     product = product if tint is None else product * decode_srgb(tint[..., :3])
     if strength is not None and strength.shape[-1] == 4:  # Without alpha it is 1.
         alpha = strength[..., 3:]
-        if tint is not None and tint.shape[:2] != alpha.shape[:2]:
-            gltf.note("a specularTexture of another size than the specularColorTexture, whose mean is taken", name)
+        if tint is not None and (tint.shape[:2] != alpha.shape[:2] or of_tint != maps.lookups["specular"]):
+            gltf.note(
+                "a specularTexture of another size than the specularColorTexture, or looked up in another way, whose "
+                "mean is taken",
+                name,
+            )
             alpha = alpha.mean()
         product = product * alpha
+    if of_tint is not None:
+        maps.lookups["specular"] = of_tint
     return product
 
 

@@ -14,6 +14,7 @@ from rts.files.gltf_materials import Material, read_material, unit_colors
 from rts.files.gltf_scenes import motion_in, read_instances, surroundings_in, warn_of_left_out
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece
+from rts.shading.textures import own_uv
 
 MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
@@ -80,8 +81,18 @@ def _piece(
     if "NORMAL" in read:
         attributes["normals"] = read["NORMAL"].numbers(), faces
     lookup, entries = material.lookup, material.entries
+    options: dict[str, Any] = {"wrap": lookup.wrap, "filter": lookup.filter}
     if (uv := f"TEXCOORD_{lookup.texcoord}") in read:
         attributes["uv"] = lookup.uv(read[uv].numbers()), faces
+    for entry, own in material.lookups.items():
+        if own[:2] == lookup[:2]:
+            continue
+        if (uv := f"TEXCOORD_{own.texcoord}") in read:
+            attributes[own_uv(entry)] = own.uv(read[uv].numbers()), faces
+        elif entries is not None:
+            entries = {name: value for name, value in entries.items() if name != entry}
+    if other := [(entry, own.wrap, own.filter) for entry, own in material.lookups.items() if own[2:] != lookup[2:]]:
+        options["samplers"] = tuple(other)
     if "TANGENT" in read and entries is not None and "normal_map" in entries:
         attributes["tangents"] = read["TANGENT"].numbers(), faces
     colors = None
@@ -99,7 +110,7 @@ def _piece(
         color,
         linear=True,
         entries=entries,
-        options={"wrap": lookup.wrap, "filter": lookup.filter},
+        options=options,
         unlit=material.unlit,
         one_sided=not material.double_sided,
     )

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.files.gltf_tree import Gltf, count_of
-from rts.files.srgb import decode_srgb, encode_srgb
 from rts.shading.textures import Wrap
 
 TRANSFORM = "KHR_texture_transform"
@@ -42,40 +41,33 @@ class Lookup(NamedTuple):
 
 
 class Maps:
-    """The maps of a material, all looked up in one way.
+    """The maps of a material.
 
     Attributes:
         gltf: the file.
-        lookup: the way of the first map that was read; None before.
+        lookups: entry of θ → the way in which its map is looked up, in the order in which maps were read.
     """
 
     def __init__(self, gltf: Gltf):
         self.gltf = gltf
-        self.lookup: Lookup | None = None
+        self.lookups: dict[str, Lookup] = {}
 
-    def read(self, entry: dict[str, Any], key: str, name: str, srgb: bool = False) -> np.ndarray | None:
+    def read(self, entry: dict[str, Any], key: str, name: str, *uses: str) -> np.ndarray | None:
         """The pixels of a map as the file has them; None if the entry has no such key, or the kind is not read.
 
-        A map with other coordinates than the first becomes its mean (1, 1, C), and one with another sampler has the
-        first one's; both are noted. `name` is for this note, and for errors. `srgb`: the map is of encoded colours,
-        whose mean is that of what they stand for.
+        `name` is for notes and errors; `uses` are the entries of θ that the map is for.
         """
         if key not in entry:
             return None
-        reference = entry[key]
-        pixels = self.gltf.picture(reference["index"], name)
-        if pixels is None:
-            return None
-        lookup = _lookup(self.gltf, reference, name)
-        self.lookup = first = self.lookup or lookup
-        if lookup[:2] != first[:2]:
-            self.gltf.note("maps with coordinates other than their material's, whose mean is taken", name)
-            pixels = decode_srgb(pixels[..., :3]) if srgb else pixels
-            mean = pixels.mean(axis=(0, 1), keepdims=True, dtype=np.float64).astype(np.float32)
-            return encode_srgb(mean) if srgb else mean
-        if lookup != first:
-            self.gltf.note("maps with a sampler other than their material's, which they get", name)
+        pixels = self.gltf.picture(entry[key]["index"], name)
+        if pixels is not None:
+            self.lookups |= dict.fromkeys(uses, _lookup(self.gltf, entry[key], name))
         return pixels
+
+    @property
+    def lookup(self) -> Lookup:
+        """The way of the first map that was read."""
+        return next(iter(self.lookups.values()), Lookup())
 
 
 def _lookup(gltf: Gltf, reference: dict[str, Any], name: str) -> Lookup:

@@ -13,7 +13,7 @@ from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 
 WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "tangents": (4,), "colors": (3, 4)}
-"""Numbers in a row of each table."""
+"""Numbers in a row of each table; other tables are coordinates of maps, as "uv" is."""
 LARGEST = float(np.finfo(np.float32).max)
 CULLS = ("none", "back", "file")
 SINGULAR = 1e-9
@@ -26,14 +26,14 @@ class Piece(NamedTuple):
     Attributes:
         vertices: (V, 3) float, local space.
         faces: (T, 3) int into `vertices`.
-        attributes: "uv", "normals", "tangents", "colors" → rows (A, C) and (T, 3) int into them, each where the file
-            has it. Colours are in [0, 1], as encoded in the file.
+        attributes: "uv", "normals", "tangents", "colors", and `own_uv` of maps with coordinates of their own → rows
+            (A, C) and (T, 3) int into them, each where the file has it. Colours are in [0, 1], as encoded in the file.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, alpha straight; or None.
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.
         linear: True if `color` and the attribute "colors" are linear rather than sRGB.
         transform: (4, 4) scene-from-local, or None.
         entries: further entries of θ, for the shader `pbr`; None for other shaders.
-        options: of the shader, "wrap" and "filter"; empty for its defaults.
+        options: of the shader, "wrap", "filter" and "samplers"; empty for its defaults.
         unlit: True if it has no light.
         one_sided: True if the file says that it is not seen from behind.
     """
@@ -59,9 +59,10 @@ def check_piece(path: Path, piece: Piece) -> None:
     """
     tables = {"vertices": (piece.vertices, piece.faces), **piece.attributes}
     for name, (rows, table) in tables.items():
-        if rows.ndim != 2 or rows.shape[1] not in WIDTHS[name]:
+        widths = WIDTHS.get(name, WIDTHS["uv"])
+        if rows.ndim != 2 or rows.shape[1] not in widths:
             raise InputError(
-                f"{path}: {name} has shape {rows.shape}; expected {WIDTHS[name][0]} numbers a row: repair the file"
+                f"{path}: {name} has shape {rows.shape}; expected {widths[0]} numbers a row: repair the file"
             )
         if table.min() < 0 or table.max() >= len(rows):
             bad = table.max() if table.max() >= len(rows) else table.min()

@@ -29,6 +29,7 @@ from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part
 from rts.shading.pbr import Pbr
 from rts.shading.shaders import Lambert, Textured, Unlit
+from rts.shading.textures import own_uv
 
 
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh", cull: str = "none") -> list[Part]:
@@ -41,7 +42,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
     follow moving vertices: drop them from θ, and smooth ones are computed that do; likewise "tangents". The shader is
     `pbr` where the material of a glTF or MTL tells more than its base colour: θ then has "metallic", "roughness",
-    "normal_map", "occlusion" and "emissive", as far as the file has them. Else it is `textured` where there are uv and
+    "normal_map", "occlusion" and "emissive", as far as the file has them, and "uv_occlusion" or the like where a map
+    has coordinates of its own. Else it is `textured` where there are uv and
     a texture, `unlit` where a glTF says that there is no light, or `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
@@ -145,7 +147,7 @@ def part_of(
     if piece.texture is not None and textured:
         theta["texture"] = piece.texture.astype(np.float32)
     if piece.entries is not None:
-        theta |= {name: x for name, x in piece.entries.items() if x.ndim < 3 or "uv" in theta}
+        theta |= {name: x for name, x in piece.entries.items() if x.ndim < 3 or {"uv", own_uv(name)} & {*theta}}
     if piece.color is not None and (piece.color < 1).any():
         theta["color"] = piece.color[: 3 if (piece.color[3:] >= 1).all() else 4].astype(np.float32)
     for name, values in theta.items():

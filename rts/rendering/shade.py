@@ -21,7 +21,7 @@ from rts.errors import InputError
 from rts.rendering.part_transforms import OneTransform, ViewTransforms
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
-from rts.shading.tangents import TANGENT, tangents
+from rts.shading.tangents import OWN_UV, TANGENT, tangents
 from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
@@ -32,7 +32,7 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     that the shader reads.
     """
     gbuffer = _evaluated(part, samples, context)
-    if "uv" in gbuffer and "normal" in gbuffer and TANGENT not in gbuffer:
+    if ("uv" in gbuffer or OWN_UV in gbuffer) and "normal" in gbuffer and TANGENT not in gbuffer:
         gbuffer.defer(TANGENT, lambda: tangents(part.surface, context.constants(part.read), samples, gbuffer, context))
     return gbuffer
 

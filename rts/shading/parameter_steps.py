@@ -25,7 +25,7 @@ def check_two_parameters(surface: Surface, samples: Samples, attribute: str, rea
 
 
 def steps_beside(
-    surface: Surface, theta: Mapping[str, Tree], samples: Samples, position: Array, uv: Array
+    surface: Surface, theta: Mapping[str, Tree], samples: Samples, position: Array, uv: Array, name: str = "uv"
 ) -> list[tuple[Array, Array]]:
     """The changes of position (N, 3), local space, and of uv (N, 2) along both parameters, a step of each.
 
@@ -37,11 +37,12 @@ def steps_beside(
         samples: the samples, in arrays of this engine.
         position: (N, 3), of the samples.
         uv: (N, 2), of the samples.
+        name: the attribute of the surface that `uv` is.
     """
     params, xp, changes = samples.params, namespace(position), []
     for i in range(2):
         axis = engine_of(params).constant(surface.param_step * np.eye(2)[i : i + 1], params)
         # A step towards the middle stays on the patch.
         beside = surface.evaluate(theta, replace(samples, params=params + xp.where(params < 0.5, axis, -axis)))
-        changes.append((beside["position"] - position, beside["uv"] - uv))
+        changes.append((beside["position"] - position, beside[name] - uv))
     return changes

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, dot, shape_of
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree
@@ -18,8 +19,12 @@ from rts.shading import microfacets
 from rts.shading.light import light_of
 from rts.shading.shaders import Unlit, is_behind
 from rts.shading.tangents import TANGENT, tangent_frame
+from rts.shading.textures import Wrap, check_sampler, own_uv, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
+from rts.shading.uv_footprints import FOOTPRINT
 
+MAPS = ("metallic", "roughness", "normal_map", "occlusion", "emissive", "specular")
+"""Entries of θ that may be maps, beside the texture."""
 DIELECTRIC = 0.04
 """The reflectance of dielectrics at normal incidence."""
 
@@ -42,14 +47,27 @@ class Pbr(Unlit):
         "specular" (), (3,) or (h, w, 3) how many times 4 % anything but a metal reflects at normal incidence, by
                                          default 1 (`KHR_materials_specular`); at most all light
 
-    Maps are looked up as the texture is. A normal map needs the G-buffer's "tangent".
+    Maps are looked up as the texture is, but for those named in `samplers`. Where the surface has an attribute
+    "uv_occlusion", the map θ["occlusion"] is looked up there, and not averaged by `mip`; so are the other maps at
+    theirs. A normal map needs the G-buffer's "tangent".
+
+    Attributes:
+        samplers: for maps that are looked up in another way the entry of θ, and its `wrap` and `filter`, three of each.
     """
 
+    samplers: tuple[tuple[str, Wrap, str], ...] = ()
     takes_views = True
-    reads = (
-        *("normal", "color", "uv", "texture", "light", "metallic", "roughness", "normal_map", TANGENT),
-        *("occlusion", "emissive", "specular"),
-    )
+    reads = "normal", "color", "uv", "texture", "light", TANGENT, *MAPS, *map(own_uv, MAPS)
+
+    def __post_init__(self):
+        super().__post_init__()
+        for one in self.samplers if isinstance(self.samplers, tuple) else (None,):
+            if not isinstance(one, tuple) or len(one) != 3 or one[0] not in MAPS:
+                raise InputError(
+                    f"samplers is {quoted(self.samplers)}; expected a tuple of (name, wrap, filter), where the name is "
+                    f"one of {', '.join(MAPS)}"
+                )
+            check_sampler(*one[1:])
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -103,6 +121,9 @@ class Pbr(Unlit):
             return entry_of(theta, name, *numbers)
         if len(shape) != 3 or shape[2] != channels or 0 in shape:
             raise InputError(f"theta[{name!r}] {described(theta[name])}; expected a map (h, w, {channels})")
-        values = self.looked_up(theta[name], gbuffer)
+        _, wrap, filter = next((one for one in self.samplers if one[0] == name), (name, self.wrap, self.filter))
+        own = own_uv(name) if own_uv(name) in gbuffer else None
+        footprint = gbuffer[FOOTPRINT] if self.mip and own is None else None
+        values = sample_texture(theta[name], gbuffer[own or "uv"], wrap, footprint, filter)
         check_base(f"theta[{name!r}]", values)
         return values

@@ -31,7 +31,7 @@ from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.light import light_of
-from rts.shading.textures import FILTERS, WRAPS, Wrap, sample_texture
+from rts.shading.textures import Wrap, check_sampler, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
 from rts.shading.uv_footprints import FOOTPRINT
 
@@ -109,11 +109,7 @@ class Unlit(Shader):
     reads = ("color", "uv", "texture")
 
     def __post_init__(self):
-        pair = self.wrap if isinstance(self.wrap, tuple) and len(self.wrap) == 2 else (self.wrap,)
-        if not all(isinstance(wrap, str) and wrap in WRAPS for wrap in pair):
-            raise InputError(f"wrap is {quoted(self.wrap)}; expected {', '.join(WRAPS)}, or two of them: u's and v's")
-        if not isinstance(self.filter, str) or self.filter not in FILTERS:
-            raise InputError(f"filter is {quoted(self.filter)}; expected one of {', '.join(FILTERS)}")
+        check_sampler(self.wrap, self.filter)
         reads = promised(self, "reads")
         if self.mip and reads is not None:
             object.__setattr__(self, "reads", (*reads, FOOTPRINT))

@@ -13,9 +13,11 @@ from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
 from rts.operations.unit import unit
 from rts.shading.parameter_steps import check_two_parameters, steps_beside
+from rts.shading.textures import own_uv
 
 TANGENT = "tangent"
 """Name of the attribute in the G-buffer."""
+OWN_UV = own_uv("normal_map")
 
 
 def tangents(
@@ -35,15 +37,17 @@ def tangents(
         surface: a surface of two parameters a sample.
         theta: the entries that the surface reads, arrays of the engine.
         samples: the samples.
-        gbuffer: "position" (N, 3), "normal" (N, 3) and "uv" (N, 2) of the samples, local space.
+        gbuffer: "position" (N, 3), "normal" (N, 3) and "uv" (N, 2) of the samples, local space. Coordinates that normal
+            maps have of their own, "uv_normal_map", take the place of "uv".
         context: the engine to compute with.
 
     Raises:
         InputError: samples have another number of parameters than two.
     """
     check_two_parameters(surface, samples, TANGENT, "normal maps")
-    params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer["uv"]))
-    beside = steps_beside(surface, theta, replace(samples, params=params), position, uv)
+    name = OWN_UV if OWN_UV in gbuffer else "uv"
+    params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer[name]))
+    beside = steps_beside(surface, theta, replace(samples, params=params), position, uv, name)
     return tangent_along(gbuffer["normal"], *beside)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, shape_of
 from rts.arrays.engines import engine_of, namespace, stopped, value_of
 from rts.arrays.trees import Array
@@ -21,6 +22,20 @@ CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 """The four texels of a bilinear lookup: down and right."""
 Wrap = str | tuple[str, str]
 """A continuation, or one along u and one along v."""
+
+
+def own_uv(name: str) -> str:
+    """The attribute that holds the coordinates of a map, θ[name], where they are others than "uv"."""
+    return f"uv_{name}"
+
+
+def check_sampler(wrap: object, filter: object) -> None:
+    """Refuse what is no continuation, or no way to read."""
+    pair = wrap if isinstance(wrap, tuple) and len(wrap) == 2 else (wrap,)
+    if not all(isinstance(one, str) and one in WRAPS for one in pair):
+        raise InputError(f"wrap is {quoted(wrap)}; expected {', '.join(WRAPS)}, or two of them: u's and v's")
+    if not isinstance(filter, str) or filter not in FILTERS:
+        raise InputError(f"filter is {quoted(filter)}; expected one of {', '.join(FILTERS)}")
 
 
 def sample_texture(

@@ -17,7 +17,7 @@ from rts.contracts.records import Samples
 from rts.contracts.shader import Shader
 from rts.rendering.shade import evaluate, split_by_view
 from rts.rendering.splats import concatenated
-from rts.shading.tangents import TANGENT
+from rts.shading.tangents import OWN_UV, TANGENT
 
 
 class Evaluated(NamedTuple):
@@ -52,7 +52,8 @@ class Evaluated(NamedTuple):
         pieces = []
         if samples.gbuffer is not None:  # Of constant surfaces.
             whole = GBuffer(samples.gbuffer)
-            if not ("uv" in whole and any(part is not None and _reads_tangents(part) for part in parts)):
+            mapped = "uv" in whole or OWN_UV in whole
+            if not (mapped and any(part is not None and _reads_tangents(part) for part in parts)):
                 return cls(_of_all(parts, [whole]), transforms, whole, None)
             samples = replace(samples, gbuffer=None)  # Tangents are made by the surface of each view.
         for part, ids, params in zip(parts, *rows, strict=True):

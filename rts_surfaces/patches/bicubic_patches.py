@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
@@ -135,9 +135,13 @@ class Patches(Parametric):
             if name in theta:
                 gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self._attribute, theta[name], where))
         if "uv" in theta:
-            derivatives = lambda: zip(slopes(rows, *where), slopes(self.bezier_rows(theta["uv"]), *where), strict=True)
-            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *derivatives()))
+            pairs = partial(self._slopes, rows, theta["uv"], where)
+            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *pairs()))
         return gbuffer
+
+    def _slopes(self, rows: Array, uv: Array, where: tuple[Array, Array, Array]) -> Iterator[tuple[Array, Array]]:
+        """Derivatives of position and uv, first along the first parameter."""
+        return zip(slopes(rows, *where), slopes(self.bezier_rows(uv), *where), strict=True)
 
     def _attribute(self, attribute: Array, where: tuple[Array, Array, Array]) -> Array:
         return values(self.bezier_rows(attribute), *where)

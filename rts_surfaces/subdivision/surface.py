@@ -260,8 +260,7 @@ class Subdivision(Parametric):
 
         gbuffer.defer("normal", lambda: unit(engine.namespace.linalg.cross(*slopes())))
         if "uv" in theta:
-            along = lambda: zip(slopes(), uv(True), strict=True)
-            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *along()))
+            gbuffer.defer("tangent", lambda: tangent_along(gbuffer["normal"], *zip(slopes(), uv(True), strict=True)))
         for name in self.reads(theta)[1:]:
             entry = G_BUFFER_NAMES.get(name, name)
             if name == "uv" and self._uv is not None:

@@ -195,27 +195,52 @@ def test_maps_may_all_use_another_set_of_coordinates(tmp_path, reference):
     np.testing.assert_allclose(part.theta["uv"], [[0.25, 1], [0.5, 0.5], [0, 0]], atol=1e-7)
 
 
-def test_what_is_not_followed_is_one_warning_that_names_it(tmp_path):
+def test_maps_may_have_coordinates_and_samplers_of_their_own(tmp_path):
     material = {
-        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": looked_up(1, SPECIFIED)},
-        "occlusionTexture": {"index": 2, "texCoord": 1},
-        "emissiveTexture": {"index": 3},
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": looked_up(0, SPECIFIED)},
+        "normalTexture": {"index": 0},
+        "occlusionTexture": {"index": 0, "texCoord": 1},
+        "emissiveTexture": {"index": 1},
         "emissiveFactor": [1, 1, 1],
-        "extensions": {"KHR_materials_clearcoat": {}, "KHR_materials_sheen": {}},
     }
-    samplers = {"samplers": [{}, {}, {}, {"wrapS": 33071}]}
-    maps = [GREY, np.array([[[0, 51, 102], [0, 153, 204]]]), GREY, GREY]
-    path = model(tmp_path, material, maps, more=samplers, TEXCOORD_1=CORNERS[:, :2], COLOR_0=CORNERS)
+    further, samplers = np.array([[0.25, 0], [0.5, 0.5], [0, 1]]), {"samplers": [{}, {"wrapS": 33071}]}
+    [part] = rts.load(model(tmp_path, material, [GREY, GREY], more=samplers, TEXCOORD_1=further))
+    for name in ("uv_metallic", "uv_roughness"):
+        np.testing.assert_allclose(part.theta[name], [[0, 0], [0, 0.5], [0.5, 0]], atol=1e-7)
+    np.testing.assert_allclose(part.theta["uv_occlusion"], [[0.25, 1], [0.5, 0.5], [0, 0]], atol=1e-7)
+    assert not {"uv_normal_map", "uv_emissive", "uv_texture"} & {*part.theta}
+    assert part.shader.samplers == (("emissive", ("clamp", "repeat"), "linear"),)
+    camera = rts.Camera.look_at((0.3, 0.3, 3), (0.3, 0.3, 0))
+    assert np.isfinite(rts.render(part, camera, (8, 8))).all()
+
+
+def test_a_map_without_its_coordinates_is_left_out(tmp_path):
+    material = {
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+        "normalTexture": {"index": 0},
+        "occlusionTexture": {"index": 0, "texCoord": 1},
+    }
+    path = model(tmp_path, material, [GREY])
+    [part] = rts.load(path)
+    assert "normal_map" in part.theta and not {"occlusion", "uv_occlusion"} & {*part.theta}
+
+
+def test_what_is_not_followed_is_one_warning_that_names_it(tmp_path):
+    shine = {"specularColorTexture": {"index": 0}, "specularTexture": looked_up(1, SPECIFIED)}
+    material = {
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+        "extensions": {"KHR_materials_clearcoat": {}, "KHR_materials_sheen": {}, "KHR_materials_specular": shine},
+    }
+    white, strength = np.full((1, 1, 3), 255), np.array([[[0, 0, 0, 51], [0, 0, 0, 153]]])
+    path = model(tmp_path, material, [white, strength], COLOR_0=CORNERS)
     with pytest.warns(rts.errors.FileWarning) as caught:
         [part] = rts.load(path)
     assert [str(warning.message) for warning in caught] == [
         f"{path} uses the extensions KHR_materials_clearcoat, KHR_materials_sheen, which are not read; it is loaded "
-        "as it is without; has maps with coordinates other than their material's, whose mean is taken: the "
-        "metallicRoughnessTexture of material 0, the occlusionTexture of material 0; has maps with a sampler other "
-        "than their material's, which they get: the emissiveTexture of material 0"
+        "as it is without; has a specularTexture of another size than the specularColorTexture, or looked up in "
+        "another way, whose mean is taken: material 0"
     ]
-    np.testing.assert_allclose(part.theta["roughness"], [[[102 / 255]]], atol=1e-6)
-    np.testing.assert_allclose(part.theta["metallic"], [[[153 / 255]]], atol=1e-6)
+    np.testing.assert_allclose(part.theta["specular"], [[[0.4, 0.4, 0.4]]], atol=1e-6)
     assert "colors" in part.theta and "texture" in part.theta
 
 

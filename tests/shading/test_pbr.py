@@ -194,6 +194,29 @@ def test_wrong_entries_are_refused(name, value, message):
         Pbr()({name: value}, gbuffer, FRONT)
 
 
+def test_a_map_with_coordinates_of_its_own_is_looked_up_there_by_its_own_sampler():
+    rng = np.random.default_rng(0)
+    points, _ = ball()
+    uv, own = rng.uniform(-1, 2, (2, len(points), 2))
+    theta = {"occlusion": rng.uniform(0, 1, (5, 4, 1)), "roughness": np.array(0.5)}
+    gbuffer = {"position": points, "normal": points, "uv": own}
+    for wrap, filter in (("repeat", "linear"), (("clamp", "mirror"), "nearest")):
+        expected = Pbr(wrap=wrap, filter=filter)(theta, GBuffer(gbuffer), CAMERA)
+        apart = {**gbuffer, "uv": uv, "uv_occlusion": own}
+        other = "nearest" if filter == "linear" else "linear"
+        shader = Pbr(wrap="mirror", filter=other, samplers=(("occlusion", wrap, filter),))
+        np.testing.assert_array_equal(shader(theta, GBuffer(apart), CAMERA), expected)
+        assert abs(shader(theta, GBuffer(gbuffer | {"uv": uv}), CAMERA) - expected).max() > 0.1
+
+
+@pytest.mark.parametrize("wrong", ["clamp", (("occlusion", "clamp"),), (("colour", "clamp", "linear"),)])
+def test_wrong_samplers_are_refused(wrong):
+    with pytest.raises(InputError, match="expected a tuple of \\(name, wrap, filter\\)"):
+        Pbr(samplers=wrong)
+    with pytest.raises(InputError, match="wrap is 'round'"):
+        Pbr(samplers=(("occlusion", "round", "linear"),))
+
+
 def test_a_map_without_uv_is_refused():
     gbuffer = GBuffer(position=np.zeros((1, 3)), normal=np.ones((1, 3)))
     with pytest.raises(InputError, match="the shader reads 'uv'"):

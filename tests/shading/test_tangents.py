@@ -40,6 +40,16 @@ def test_tangents_are_where_u_grows_and_the_sign_says_where_v_does():
     np.testing.assert_allclose(seen(sheared), [1, 0, 0, 1], atol=1e-5)
 
 
+def test_normal_maps_with_coordinates_of_their_own_have_tangents_along_these():
+    vertices, faces = quad(-1, 1, -1, 1)
+    theta = {"vertices": vertices, "uv": UV, "uv_normal_map": np.ascontiguousarray(UV[:, ::-1])}
+    for left_out in ((), ("uv",)):
+        kept = {name: rows for name, rows in theta.items() if name not in left_out}
+        part = rts.Part(rts.Mesh(faces, {"uv_normal_map": None}), kept, tangent_of)
+        pixel = np.asarray(show(part, FRONT, splatter="none"))[SIZE[0] // 2, SIZE[1] // 2]
+        np.testing.assert_allclose([*(2 * pixel[:3] / pixel[3] - 1), 4 * pixel[3] - 3], [0, 1, 0, -1], atol=1e-5)
+
+
 def test_tangents_move_with_the_part_and_a_mirror_changes_their_sign():
     turn = rigid((0, 0, 1), 30)
     np.testing.assert_allclose(seen(UV, transform=turn), [np.cos(np.pi / 6), 0.5, 0, 1], atol=1e-5)
