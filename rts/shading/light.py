@@ -9,6 +9,10 @@
     "position" (3,) or (P, 3)        of point lights
     "intensity" (3,) or (P, 3)       of point lights, by default 1: the "color" that they have at a distance of 1, and
                                      less with the square of the distance
+    "axis" (3,) or (P, 3)            the direction in which a spot light shines, of any length; zero, the default, for a
+                                     point light that shines all around
+    "cone" (2,) or (P, 2)            of spot lights, by default 0 and π / 4: the angles from the axis up to which they
+                                     are as bright as on it, and from which they are dark; radians, by glTF's formula
     "ambient" () or (3,)             light from all around, by default 0.2: its radiance
     "sh" (1, 3), (4, 3), (9, 3)      radiance from each direction, as coefficients of `rts.shading.harmonics`
       or (16, 3)
@@ -22,9 +26,12 @@ distant lights unless it has a "direction" or a "color", and no ambient light un
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import dot, shape_of
@@ -42,10 +49,16 @@ from rts.shading.visibility import Seen, mean_visibility
 AMBIENT, COLOR = 0.2, 0.8
 DIRECTION = (-0.3, 0.5, 0.81)
 """The default direction, in camera space."""
+CONE = (0.0, math.pi / 4)
 FURTHER = ("position", "sh", "environment")
 """Entries besides which there are no defaults."""
-PLURALS = {"color": "colors", "intensity": "intensities"}
-ENTRIES = ("direction", "color", "position", "intensity", "ambient", "sh", "environment", "shadow")
+PLURALS = {"color": "colors", "intensity": "intensities", "axis": "axes", "cone": "cones"}
+ENTRIES = (
+    *("direction", "color", "position", "intensity", "axis", "cone"),
+    *("ambient", "sh", "environment", "shadow"),
+)
+LEAST_FADE = 1e-3
+"""The least difference of the cosines of a cone's two angles, as glTF says."""
 
 
 @dataclass
@@ -54,7 +67,7 @@ class Light:
 
     Attributes:
         distant: for each distant light the unit vector towards it, (3,) or (N, 3), and its colour.
-        points: for each point light its position (3,) and intensity.
+        points: for each point light its position (3,), intensity, axis (3,) and cone (2,); axes are None without any.
         ambient: the radiance from all around, a number, () or (3,); None for none.
         sh: coefficients (n, 3); None for none.
         environment: the result of `prefiltered`; None for none.
@@ -62,7 +75,7 @@ class Light:
     """
 
     distant: list[tuple[Array, Any]] = field(default_factory=list)
-    points: list[tuple[Array, Any]] = field(default_factory=list)
+    points: list[tuple[Array, Any, Any, Any]] = field(default_factory=list)
     ambient: Any = None
     sh: Array | None = None
     environment: Mapping[str, Array] | None = None
@@ -83,11 +96,12 @@ class Light:
     def _unshadowed(self, positions: Array) -> Iterator[tuple[Array, Any]]:
         """The result of `lamps` without shadows."""
         yield from self.distant
-        for position, intensity in self.points:
+        for position, intensity, axis, cone in self.points:
             offset = position - positions
-            square = dot(offset, offset)
+            square, toward = dot(offset, offset), unit(offset)
             # A light has no effect on the point where it is.
-            yield unit(offset), intensity / namespace(square).where(square > 0, square, square + 1)
+            brightness = intensity / namespace(square).where(square > 0, square, square + 1)
+            yield toward, brightness if axis is None else brightness * _in_cone(toward, axis, cone)
 
     def diffuse(self, normals: Array) -> Any:
         """The irradiance / π of surfaces with unit normals (N, 3), of all light but lamps: a number, (3,) or (N, 3)."""
@@ -143,9 +157,9 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
             directions = [camera.to_world(DIRECTION)]
         light.distant = _paired("direction", directions, "color", entries, COLOR)
     if "position" in entries:
-        light.points = _paired("position", _separate_vectors(entries["position"]), "intensity", entries, 1.0)
-    elif "intensity" in entries:
-        raise InputError("theta['light'] has an intensity of point lights, but no position; give both, or a color")
+        light.points = _points(entries)
+    elif given := [name for name in ("intensity", "axis", "cone") if name in entries]:
+        raise InputError(f"theta['light'] has {given[0]!r}, but no 'position' of point lights; give both, or a 'color'")
     if "environment" in entries:
         environment = entries["environment"]
         light.environment = environment if isinstance(environment, Mapping) else prefiltered(environment)
@@ -183,7 +197,9 @@ def _check(name: str, value: Any) -> None:
         else:
             check_entry(place, value, "(h, w, 3)", len(shape) == 3 and shape[2] == 3 and 0 not in shape)
     else:
-        check_entry(place, value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0)
+        width = 2 if name == "cone" else 3
+        fits = len(shape) in (1, 2) and shape[-1] == width and shape[0] > 0
+        check_entry(place, value, f"({width},) or (L, {width})", fits)
 
 
 def _check_shadow(value: Any) -> None:
@@ -198,8 +214,36 @@ def _check_shadow(value: Any) -> None:
             )
 
 
-def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, Any], default: float) -> list[tuple]:
-    """Each place of a light with its brightness, of which one may serve all."""
+def _points(entries: Mapping[str, Any]) -> list[tuple[Array, Any, Any, Any]]:
+    """`Light.points`."""
+    positions = _separate_vectors(entries["position"])
+    pairs = _paired("position", positions, "intensity", entries, 1.0)
+    if "axis" not in entries:
+        if "cone" in entries:
+            raise InputError("theta['light'] has a cone, but no axis; give both")
+        return [(*pair, None, None) for pair in pairs]
+    cones = value_of(entries.get("cone", np.array(CONE)))
+    if cones is not None and not ((cones[..., 0] >= 0) & (cones[..., 1] >= cones[..., 0])).all():
+        raise InputError(
+            f"theta['light']['cone'] is {quoted(cones)}; expected two angles, the first from 0 on, the second at least "
+            f"as large"
+        )
+    axes, cones = (_paired("position", positions, name, entries, CONE) for name in ("axis", "cone"))
+    return [(*pair, axis, cone) for pair, (_, axis), (_, cone) in zip(pairs, axes, cones, strict=True)]
+
+
+def _in_cone(toward: Array, axis: Array, cone: Any) -> Array:
+    """The share (N, 1) of a spot light's brightness that points get, from unit vectors (N, 3) towards it."""
+    xp = namespace(toward, axis)
+    inner, outer = (xp.cos(x) if hasattr(x, "dtype") else math.cos(x) for x in (cone[0], cone[1]))
+    fade = inner - outer
+    fade = xp.where(fade > LEAST_FADE, fade, LEAST_FADE) if hasattr(fade, "dtype") else max(fade, LEAST_FADE)
+    share = xp.clip((-dot(toward, unit(axis)) - outer) / fade, 0.0, 1.0)
+    return xp.where(dot(axis, axis) > 0, share * share, xp.ones_like(share))
+
+
+def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, Any], default: Any) -> list[tuple]:
+    """Each place of a light with its entry `name`, of which one may serve all."""
     values = _separate_vectors(entries[name]) if name in entries else [default]
     if len(values) not in (1, len(places)):
         raise InputError(f"theta['light'] has {len(places)} {place}s but {len(values)} {PLURALS[name]}")
@@ -207,6 +251,6 @@ def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, An
 
 
 def _separate_vectors(vectors: Array) -> list[Array]:
-    """The vectors (3,) of an array (3,) or (L, 3)."""
-    vectors = namespace(vectors).reshape(vectors, (-1, 3))
+    """The vectors (C,) of an array (C,) or (L, C)."""
+    vectors = namespace(vectors).reshape(vectors, (-1, shape_of(vectors)[-1]))
     return [vectors[i, :] for i in range(vectors.shape[0])]

@@ -38,13 +38,11 @@ def test_lights_are_in_the_form_that_shaders_read(tmp_path):
         {"type": "directional", "color": [1, 0.5, 0], "intensity": np.pi},
         {"type": "point", "intensity": 2 * np.pi},
         {"type": "directional"},
-        {"type": "spot", "spot": {}},
         {"type": "point", "range": 5},
     ]
     nodes = [
         {"rotation": QUARTER_ABOUT_Y, "scale": [3, 3, 3]},
         {"translation": [1, 2, 3]},
-        {},
         {},
         {"children": []},
     ]
@@ -57,10 +55,21 @@ def test_lights_are_in_the_form_that_shaders_read(tmp_path):
     order = np.argsort(found["position"][:, 0])
     np.testing.assert_allclose(found["position"][order], [[0, 0, 0], [1, 2, 3]], atol=1e-6)
     np.testing.assert_allclose(found["intensity"][order], [[1 / np.pi] * 3, [2] * 3], atol=1e-6)
-    assert gltf.notes == {
-        "spot lights, which are left out": ["the light of node 3"],
-        "lights of limited range, which is not followed": ["the light of node 4"],
-    }
+    assert gltf.notes == {"lights of limited range, which is not followed": ["the light of node 3"]}
+
+
+def test_spot_lights_have_an_axis_and_a_cone(tmp_path):
+    lights = [
+        {"type": "spot", "intensity": np.pi, "spot": {"innerConeAngle": 0.2, "outerConeAngle": 0.5}},
+        {"type": "spot", "spot": {}},
+        {"type": "point"},
+    ]
+    nodes = [{"rotation": QUARTER_ABOUT_Y, "scale": [3, 3, 3]}, {"translation": [1, 2, 3]}, {"translation": [2, 0, 0]}]
+    found = read_lights(lit(tmp_path, lights, nodes))
+    order = np.argsort(found["position"][:, 0])
+    np.testing.assert_allclose(found["axis"][order], [[-1, 0, 0], [0, 0, -1], [0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(found["cone"][order], [[0.2, 0.5], [0, np.pi / 4], [0, np.pi / 4]], atol=1e-6)
+    np.testing.assert_allclose(found["intensity"][order][0], [1, 1, 1], atol=1e-6)
 
 
 def test_a_white_surface_in_one_lux_has_a_radiance_of_one_over_pi(tmp_path):
@@ -83,6 +92,8 @@ def test_files_without_lights_have_none(tmp_path):
         ({"type": "point", "intensity": -1}, {}, "the light of node 0 has intensity -1"),
         ({"type": "point", "intensity": 1e300}, {}, "has intensity 1e.300; expected a number from 0 to 1e.12"),
         ({"type": "point", "intensity": True}, {}, "has intensity True; expected a number"),
+        ({"type": "spot", "spot": {"innerConeAngle": 1}}, {}, r"the light of node 0 has the cone \[1, 0.78"),
+        ({"type": "spot", "spot": {"outerConeAngle": 2}}, {}, r"the cone \[0.0, 2\]; expected two angles, rising"),
         ({"type": "point"}, {"scale": [1, 1, 0]}, "the transform of the light of node 0 is singular"),
         ({}, {}, "the light of node 0: 'type' is missing"),
     ],

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, FRONT, arrays, to_numpy
+from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, finite_difference, gradient, to_numpy
 
 from rts import GBuffer, InputError
 from rts.shading import harmonics, irradiance, prefiltered, tonemap, turned_environment
@@ -31,6 +31,55 @@ def test_a_point_light_fades_with_the_square_of_its_distance(shader):
     way, square = np.array([0, 1, 2.0]), 5.0
     far = {"direction": way, "color": np.array([3, 2, 1]) / square, "ambient": 0}
     np.testing.assert_allclose(near, shade(shader, far, (0.1, 0.2, 0)), atol=1e-12)
+
+
+CONE = np.array([0.3, 0.6])
+SPOT = {"position": np.array([0, 0, 2.0]), "intensity": np.full(3, 4.0)}
+
+
+def floor_lit_by(light, points):
+    """The colour of a white floor, z = 0, at points (N, 2), without any cosine of the floor."""
+    position = np.column_stack([points, np.zeros(len(points))])
+    toward = light["position"] - position
+    gbuffer = GBuffer(position=position, normal=toward)
+    return Lambert()({"light": {**light, "ambient": np.zeros(())}}, gbuffer, FRONT)[:, 0] * (toward**2).sum(axis=1)
+
+
+def test_a_spot_light_fades_between_the_two_angles_of_its_cone():
+    angle = np.linspace(0, 1.2, 50)
+    points = 2 * np.tan(angle)[:, None] * [np.cos(0.4), np.sin(0.4)]
+    found = floor_lit_by({**SPOT, "axis": np.array([0, 0, -3.0]), "cone": CONE}, points)
+    share = np.clip((np.cos(angle) - np.cos(0.6)) / (np.cos(0.3) - np.cos(0.6)), 0, 1)
+    np.testing.assert_allclose(found, 4 * share**2, atol=1e-12)
+    assert (found[angle < 0.3] > 3.999).all() and (found[angle > 0.6] == 0).all()
+    hard = floor_lit_by({**SPOT, "axis": np.array([0, 0, -1.0]), "cone": np.array([0.5, 0.5])}, points)
+    np.testing.assert_allclose(hard[abs(angle - 0.5) > 0.01], 4.0 * (angle < 0.5)[abs(angle - 0.5) > 0.01], atol=1e-9)
+    default = floor_lit_by({**SPOT, "axis": np.array([0, 0, -1.0])}, points)
+    np.testing.assert_allclose(
+        default, 4 * np.clip((np.cos(angle) - np.sqrt(0.5)) / (1 - np.sqrt(0.5)), 0, 1) ** 2, atol=1e-9
+    )
+
+
+def test_a_light_without_an_axis_beside_spot_lights_shines_all_around():
+    points = np.random.default_rng(0).uniform(-3, 3, (30, 2))
+    even = floor_lit_by({**SPOT, "axis": np.zeros(3), "cone": CONE}, points)
+    np.testing.assert_array_equal(even, floor_lit_by(SPOT, points))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_spot_light_has_derivatives_in_all_its_entries(target):
+    light = {"position": np.array([[0.2, 0.1, 2.0]]), "axis": np.array([[0.1, 0, -1.0]]), "cone": CONE[None]}
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+    fixed = np.column_stack([points, np.zeros(40)]), np.tile([0, 0, 1.0], (40, 1))
+
+    def f(light, position, normal):
+        return Lambert()({"light": light}, GBuffer(position=position, normal=normal), FRONT)[:, :3].sum()
+
+    expected = finite_difference(lambda light: f(light, *fixed), light, 1e-6)
+    found = gradient(target, lambda light: f(light, *arrays(target, fixed)), arrays(target, light))
+    for name in light:
+        assert abs(expected[name]).max() > 0.1
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-3 * abs(expected[name]).max())
 
 
 @pytest.mark.parametrize("shader", SHADERS)
@@ -107,7 +156,12 @@ def test_engines_blur_an_environment_alike(target):
         ({"sh": np.zeros((5, 3))}, r"expected an array of shape \(n, 3\), n = 1, 4, 9 or 16"),
         ({"environment": np.zeros((4, 8))}, r"expected an array of shape \(h, w, 3\)"),
         ({"environment": {"sh": np.zeros((9, 3))}}, "expected an image, or what prefiltered made of it"),
-        ({"intensity": np.ones(3)}, "intensity of point lights, but no position"),
+        ({"intensity": np.ones(3)}, "has 'intensity', but no 'position' of point lights"),
+        ({"axis": np.ones(3)}, "has 'axis', but no 'position' of point lights"),
+        ({"position": np.ones(3), "cone": np.ones(2)}, "has a cone, but no axis"),
+        ({"position": np.ones(3), "axis": np.ones(3), "cone": np.ones(3)}, r"expected an array of shape \(2,\) or"),
+        ({"position": np.ones(3), "axis": np.ones(3), "cone": np.array([2, 1.0])}, "expected two angles, the first"),
+        ({"position": np.ones(3), "axis": np.ones((2, 3))}, "has 1 positions but 2 axes"),
         ({"position": np.ones((2, 3)), "intensity": np.ones((3, 3))}, "has 2 positions but 3 intensities"),
         ({"colour": np.ones(3)}, "has an entry 'colour'; expected direction"),
     ],
