@@ -23,6 +23,7 @@ class Shape(NamedTuple):
         uv: (V, 2), v up.
         material: "color" (3,) or "texture" (h, w, 3), "metallic" and "roughness", () or (h, w, 1), "normal_map"
             (h, w, 3) and "emissive" (h, w, 3), as the shader `pbr` has them.
+        colors: (V, 3), in place of a texture; or None.
     """
 
     vertices: np.ndarray
@@ -30,11 +31,13 @@ class Shape(NamedTuple):
     normals: np.ndarray
     uv: np.ndarray
     material: Mapping[str, np.ndarray]
+    colors: np.ndarray | None = None
 
     @property
     def part(self) -> rts.Part:
         """The mesh with the shader `pbr`; textures are averaged over footprints."""
         own = {"vertices": self.vertices, "normals": self.normals, "uv": self.uv}
+        own |= {} if self.colors is None else {"colors": self.colors}
         return rts.Part(rts.Mesh(self.faces), {**own, **self.material}, rts.plugin("shaders", "pbr")(mip=True))
 
 
@@ -66,7 +69,10 @@ def pictures(
         for i, shape in enumerate(shapes):
             path = Path(folder) / f"{i}.ply"
             _write_ply(shape, path)
-            scene[f"shape{i}"] = {"type": "ply", "filename": str(path), "bsdf": _principled(mi, shape.material)}
+            scene[f"shape{i}"] = {"type": "ply", "filename": str(path), "bsdf": _principled(mi, shape)}
+            if shape.colors is not None:
+                scene[f"shape{i}"] = mi.load_dict(scene[f"shape{i}"])
+                scene[f"shape{i}"].add_attribute("vertex_color", 3, shape.colors.astype(np.float32).ravel())
             if "emissive" in shape.material:
                 radiance = _texture(mi, shape.material["emissive"])
                 scene[f"shape{i}"]["emitter"] = {"type": "area", "radiance": radiance}
@@ -87,10 +93,12 @@ def pictures(
     return found
 
 
-def _principled(mi: Any, material: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _principled(mi: Any, shape: Shape) -> dict[str, Any]:
     """A material with glTF's numbers: dielectrics reflect 4 %."""
-    base = material["texture"] if "texture" in material else material["color"]
-    bsdf: dict[str, Any] = {"type": "principled", "specular": 0.5, "base_color": _texture(mi, base)}
+    material, attribute = shape.material, {"type": "mesh_attribute", "name": "vertex_color"}
+    base = material["texture"] if "texture" in material else material.get("color")
+    base = attribute if base is None else _texture(mi, base)
+    bsdf: dict[str, Any] = {"type": "principled", "specular": 0.5, "base_color": base}
     for name in ("metallic", "roughness"):
         bsdf[name] = _texture(mi, material[name])
     if "normal_map" in material:
