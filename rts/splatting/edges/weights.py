@@ -107,6 +107,15 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | Non
     weights = kept or _Weights.of(outlines)
     t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
     parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
+    _push_outlines(operands, (t_positions, t_rgba), outlines, weights, out)
+
+
+def _push_outlines(operands: Arrays, tangents: Some, outlines: Outlines, weights: _Weights, out: np.ndarray) -> None:
+    """Add to a derivative (H, W, C) what changes at outlines; arguments as of `push`."""
+    from rts.splatting.edges import weights_loops as loops
+
+    _, rgba, row, *_ = operands
+    t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown) if len(t_positions) else 0, 2))
     if len(t_positions):
         loops.motions(t_positions, weights.movers, NOWHERE, weights.moves, motion)
@@ -162,32 +171,75 @@ def normal_equations(
 
     `operands` are those of `forward`; `others` are t_positions, t_rgba, target, weights and background, or None.
     """
-    t_positions, t_rgba, target, weights, background = others
-    row, dtype = operands[2], operands[1].dtype
-    side, channels = (row.shape[0] - 2 * border) // target.shape[0], target.shape[2]
+    t_positions, t_rgba, *fields = others
+    positions, rgba, row, *arrays = operands
+    (height, width, channels), side = fields[0].shape, (row.shape[0] - 2 * border) // fields[0].shape[0]
+    target, weights, background = (None if x is None else x.reshape(height * width, -1) for x in fields)
 
-    def seen(whole: np.ndarray, behind: float) -> np.ndarray:
-        """The channels of pixels that are compared, over the background; `behind` is 0 for tangents."""
-        (height, width), inside = target.shape[:2], slice(border, -border if border else None)
-        image = whole[inside, inside]
-        image = image.reshape(height, side, width, side, -1).mean((1, 3)) if side > 1 else image.copy()
+    def compared(image: np.ndarray, behind: float, at: Any) -> np.ndarray:
+        """The channels of pixels `at` that are compared, over the background; `behind` is 0 for tangents."""
         if background is not None:
-            image += (behind - image[..., -1:]) * background
-        image = image[..., -1:] if channels == 1 else image[..., :channels]
-        return image if weights is None else image * weights
+            image = image + (behind - image[:, -1:]) * background[at]
+        image = image[:, -1:] if channels == 1 else image[:, :channels]
+        return image if weights is None else image * weights[at]
 
-    image = np.empty((*row.shape, operands[1].shape[1]), dtype)
+    image = np.empty((*row.shape, rgba.shape[1]), rgba.dtype)
     kept = forward(operands, image)
-    r = (seen(image, 1.0) - (target if weights is None else target * weights)).reshape(-1)
-    jacobian = np.empty((len(t_positions), r.size), dtype)
+    whole = image[border : border + height * side, border : border + width * side]
+    whole = whole.reshape(height, side, width, side, -1).mean((1, 3)).reshape(height * width, -1)
+    r = compared(whole, 1.0, slice(None)) - (target if weights is None else target * weights)
+    # Derivatives are zero but in these cells, each of a pixel that is `pixels[first]` or between two of these.
+    outlines = _effective(Outlines(*arrays))
+    even = t_rgba is None and bool((rgba == rgba[:1]).all())
+    cells, pixels, first = _reached(outlines, kept, row, (height, width, side, border), even)
+    jacobian = np.empty((len(t_positions), len(first) * channels), rgba.dtype)
+    flat = image.reshape(-1, rgba.shape[1])
+    flat[cells] = 0.0
     for i, tangent in enumerate(t_positions):
-        push(operands, (tangent, None if t_rgba is None else t_rgba[i]), image, kept)
-        jacobian[i] = seen(image, 0.0).reshape(-1)
-    value = np.mean(r * r) if loss is None else loss(r)
-    if loss is not None and loss.robust:
-        w, curvatures = loss.weights(r)
-        return np.asarray(value), (jacobian * curvatures) @ jacobian.T / r.size, jacobian @ (w * r) / r.size
-    return np.asarray(value), jacobian @ jacobian.T / r.size, jacobian @ r / r.size
+        tangents = tangent, None if t_rgba is None else t_rgba[i]
+        if even:
+            _push_outlines(operands, tangents, outlines, kept, image)
+        else:
+            push(operands, tangents, image, kept)
+        changes = np.add.reduceat(flat[cells], first, axis=0) / side**2 if len(first) else flat[:0]
+        jacobian[i] = compared(changes, 0.0, pixels).reshape(-1)
+        flat[cells] = 0.0
+    here, size = r[pixels].reshape(-1), r.size
+    value = np.mean(r * r) if loss is None else loss(r.reshape(-1))
+    if loss is not None and loss.robust and here.size:
+        w, curvatures = loss.weights(here)
+        return np.asarray(value), (jacobian * curvatures) @ jacobian.T / size, jacobian @ (w * here) / size
+    return np.asarray(value), jacobian @ jacobian.T / size, jacobian @ here / size
+
+
+def _reached(
+    outlines: Outlines, weights: _Weights, row: np.ndarray, grid: tuple[int, int, int, int], even: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The cells whose colours may change, by pixels.
+
+    Args:
+        outlines: on the host.
+        weights: of these outlines.
+        row: (H, W) int32.
+        grid: height and width of the image in pixels, cells along the side of a pixel, and cells of its border.
+        even: True if all samples have one constant colour, so that nothing changes but at outlines.
+
+    Returns:
+        Flat indices (n,) of cells; the flat indices (m,) of their pixels; and for each pixel its first place in cells.
+    """
+    height, width, side, border = grid
+    reached = np.zeros(row.shape, bool) if even else row >= 0
+    y, x = outlines.square.T
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        reached[y + down, x + right] = True
+    beside = weights.cells[weights.cells[:, :, 0] >= 0]
+    reached.reshape(-1)[beside[:, :2]] = True
+    y, x = reached[border : border + height * side, border : border + width * side].nonzero()
+    pixel = (y // side) * width + x // side
+    order = np.argsort(pixel, kind="stable")
+    pixels, first = np.unique(pixel[order], return_index=True)
+    cells = (y + border) * row.shape[1] + x + border
+    return cells[order], pixels, first
 
 
 def _effective(outlines: Outlines) -> Outlines:
