@@ -167,7 +167,7 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
 def normal_equations(
     operands: Arrays, others: Arrays, border: int, loss: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`SummingSplatter.normal_equations` on the host, by an image for each tangent.
+    """`SummingSplatter.normal_equations` on the host, by tangents of the pixels that may change.
 
     `operands` are those of `forward`; `others` are t_positions, t_rgba, target, weights and background, or None.
     """
@@ -186,9 +186,11 @@ def normal_equations(
     image = np.empty((*row.shape, rgba.shape[1]), rgba.dtype)
     kept = forward(operands, image)
     whole = image[border : border + height * side, border : border + width * side]
-    whole = whole.reshape(height, side, width, side, -1).mean((1, 3)).reshape(height * width, -1)
+    if side > 1:
+        whole = whole.reshape(height, side, width, side, -1).mean((1, 3))
+    whole = whole.reshape(height * width, -1)
     r = compared(whole, 1.0, slice(None)) - (target if weights is None else target * weights)
-    # Derivatives are zero but in these cells, each of a pixel that is `pixels[first]` or between two of these.
+    # Derivatives are zero but in these cells, pixel after pixel.
     outlines = _effective(Outlines(*arrays))
     even = t_rgba is None and bool((rgba == rgba[:1]).all())
     cells, pixels, first = _reached(outlines, kept, row, (height, width, side, border), even)
