@@ -23,7 +23,10 @@ SHADER_ENTRIES = (
 )
 """Names that built-in surfaces and shaders read. They cause no warning: files hold them for any shader."""
 
-ATTRIBUTES = ("position", "normal", "uv", TANGENT, FOOTPRINT, *map(own_uv, MAPS))
+OF_MAPS = frozenset(map(own_uv, MAPS))
+"""Attributes that are coordinates of single maps."""
+
+ATTRIBUTES = ("position", "normal", "uv", TANGENT, FOOTPRINT, *OF_MAPS)
 """Names that are attributes of the G-buffer only; "color" may be an entry of θ, too."""
 
 ALIKE = 0.8
@@ -62,8 +65,15 @@ def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
     """Warn of unread entries of θ whose names almost match one that would be read; built-in names cause no warning."""
     for index, part in enumerate(parts):
         shaded = shaded_by(part)
-        for name in unread(part, shaded):
+        for name in unread(part, None if shaded is None else shaded - OF_MAPS):
             if name in SURFACE_ENTRIES or name in SHADER_ENTRIES:
+                continue
+            if name in OF_MAPS:
+                warn(
+                    f"theta[{name!r}] of part {index} is not read; the surface must declare it, such as by "
+                    f"rts.Mesh(faces, {{{name!r}: None}})",
+                    InputWarning,
+                )
                 continue
             meant = likely_name(part, name, shaded or ())
             if meant is not None:

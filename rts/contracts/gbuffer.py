@@ -17,7 +17,7 @@ class GBuffer(dict):
     shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
     ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent"
     (N, 4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal
-    × tangent.
+    × tangent. Coordinates of normal maps alone, "uv_normal_map", take the place of "uv" there.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):

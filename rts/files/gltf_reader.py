@@ -90,7 +90,9 @@ def _piece(
         if (uv := f"TEXCOORD_{own.texcoord}") in read:
             attributes[own_uv(entry)] = own.uv(read[uv].numbers()), faces
         elif entries is not None:
-            entries = {name: value for name, value in entries.items() if name != entry}
+            gltf.note("maps without their coordinates, whose mean is taken", f"the {entry} of {name}")
+            mean = {} if entry == "normal_map" else {entry: entries[entry].mean(axis=(0, 1))}
+            entries = {key: value for key, value in entries.items() if key != entry} | mean
     if other := [(entry, own.wrap, own.filter) for entry, own in material.lookups.items() if own[2:] != lookup[2:]]:
         options["samplers"] = tuple(other)
     if "TANGENT" in read and entries is not None and "normal_map" in entries:

@@ -18,7 +18,7 @@ from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
 from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_reader import read_gltf
-from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
+from rts.files.model_pieces import WIDTHS, Piece, check_cull, check_piece, cull_of
 from rts.files.obj_reader import read_obj
 from rts.files.off_reader import read_off
 from rts.files.paths import as_path, beside
@@ -236,6 +236,10 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     same = all(piece.entries is pieces[0].entries for piece in pieces)
     if not same:
         warn(f"{path}: its parts have different materials; merged, they keep base colours alone", FileWarning)
+    options = pieces[0].options
+    if not same:  # Without the maps, nothing reads how they are looked up.
+        options = {name: value for name, value in options.items() if name != "samplers"}
+        whole = {name: pair for name, pair in whole.items() if name in WIDTHS}
     return pieces[0]._replace(
         vertices=vertices,
         faces=faces,
@@ -243,6 +247,7 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
         color=None,
         linear=True,
         transform=None,
+        options=options,
         entries=pieces[0].entries if same else None,
         unlit=all(piece.unlit for piece in pieces),
         one_sided=all(piece.one_sided for piece in pieces),

@@ -26,7 +26,7 @@ from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """The part's G-buffer at the samples, local space, with deferred tangents if it has "uv" but no "tangent".
+    """The part's G-buffer at the samples, local space, with deferred tangents if it has coordinates but no "tangent".
 
     The samples' own G-buffer is taken, if they have one, where the surface's θ is constant and the G-buffer has all
     that the shader reads.

@@ -89,7 +89,7 @@ class Model:
         nodes: its nodes.
         skins: its skins.
         clips: its clips.
-        lights: θ["light"] of its directional and point lights, at rest; empty if there are none.
+        lights: θ["light"] of its directional, point and spot lights, at rest; empty if there are none.
         cameras: its cameras, at rest, in the order of their nodes.
         camera_names: the name of each: its node's, else its own, else "".
     """

@@ -11,7 +11,7 @@
                                      less with the square of the distance
     "axis" (3,) or (P, 3)            the direction in which a spot light shines, of any length; zero, the default, for a
                                      point light that shines all around
-    "cone" (2,) or (P, 2)            of spot lights, by default 0 and π / 4: the angles from the axis up to which they
+    "cone" (2,) or (P, 2)            beside an axis, by default 0 and π / 4: the angles from the axis up to which they
                                      are as bright as on it, and from which they are dark; radians, by glTF's formula
     "ambient" () or (3,)             light from all around, by default 0.2: its radiance
     "sh" (1, 3), (4, 3), (9, 3)      radiance from each direction, as coefficients of `rts.shading.harmonics`
@@ -50,6 +50,8 @@ AMBIENT, COLOR = 0.2, 0.8
 DIRECTION = (-0.3, 0.5, 0.81)
 """The default direction, in camera space."""
 CONE = (0.0, math.pi / 4)
+WIDEST = math.pi + 1e-6
+"""The largest angle of a cone, with room for rounding."""
 FURTHER = ("position", "sh", "environment")
 """Entries besides which there are no defaults."""
 PLURALS = {"color": "colors", "intensity": "intensities", "axis": "axes", "cone": "cones"}
@@ -223,11 +225,13 @@ def _points(entries: Mapping[str, Any]) -> list[tuple[Array, Any, Any, Any]]:
             raise InputError("theta['light'] has a cone, but no axis; give both")
         return [(*pair, None, None) for pair in pairs]
     cones = value_of(entries.get("cone", np.array(CONE)))
-    if cones is not None and not ((cones[..., 0] >= 0) & (cones[..., 1] >= cones[..., 0])).all():
-        raise InputError(
-            f"theta['light']['cone'] is {quoted(cones)}; expected two angles, the first from 0 on, the second at least "
-            f"as large"
-        )
+    if cones is not None:
+        inner, outer = cones[..., 0], cones[..., 1]
+        if not ((inner >= 0) & (outer >= inner) & (outer <= WIDEST)).all():
+            raise InputError(
+                f"theta['light']['cone'] is {quoted(cones)}; expected two angles from 0 to π, in radians, the second "
+                f"no smaller than the first"
+            )
     axes, cones = (_paired("position", positions, name, entries, CONE) for name in ("axis", "cone"))
     return [(*pair, axis, cone) for pair, (_, axis), (_, cone) in zip(pairs, axes, cones, strict=True)]
 
@@ -239,7 +243,7 @@ def _in_cone(toward: Array, axis: Array, cone: Any) -> Array:
     fade = inner - outer
     fade = xp.where(fade > LEAST_FADE, fade, LEAST_FADE) if hasattr(fade, "dtype") else max(fade, LEAST_FADE)
     share = xp.clip((-dot(toward, unit(axis)) - outer) / fade, 0.0, 1.0)
-    return xp.where(dot(axis, axis) > 0, share * share, xp.ones_like(share))
+    return xp.where(xp.any(axis != 0), share * share, xp.ones_like(share))
 
 
 def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, Any], default: Any) -> list[tuple]:

@@ -62,7 +62,7 @@ class Pbr(Unlit):
     def __post_init__(self):
         super().__post_init__()
         for one in self.samplers if isinstance(self.samplers, tuple) else (None,):
-            if not isinstance(one, tuple) or len(one) != 3 or one[0] not in MAPS:
+            if not isinstance(one, tuple) or len(one) != 3 or not isinstance(one[0], str) or one[0] not in MAPS:
                 raise InputError(
                     f"samplers is {quoted(self.samplers)}; expected a tuple of (name, wrap, filter), where the name is "
                     f"one of {', '.join(MAPS)}"
@@ -124,6 +124,8 @@ class Pbr(Unlit):
         _, wrap, filter = next((one for one in self.samplers if one[0] == name), (name, self.wrap, self.filter))
         own = own_uv(name) if own_uv(name) in gbuffer else None
         footprint = gbuffer[FOOTPRINT] if self.mip and own is None else None
+        if own is not None and shape_of(gbuffer[own])[1:] != (2,):
+            raise InputError(f"the surface's {own!r} {described(gbuffer[own])}; expected (N, 2), coordinates of a map")
         values = sample_texture(theta[name], gbuffer[own or "uv"], wrap, footprint, filter)
         check_base(f"theta[{name!r}]", values)
         return values

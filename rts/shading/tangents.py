@@ -61,7 +61,7 @@ def tangent_along(normal: Array, first: tuple[Array, Array], second: tuple[Array
 
     Returns:
         (N, 4): the unit direction in which u grows and v stays, and the sign of the bitangent. The direction is zero
-        where uv does not change.
+        where uv does not change, and where the surface does not, as at a point that is a whole side of a patch.
     """
     xp, (a, da), (b, db) = namespace(normal), first, second
     (au, av), (bu, bv) = ((change[:, :1], change[:, 1:2]) for change in (da, db))

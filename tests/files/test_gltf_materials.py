@@ -214,15 +214,38 @@ def test_maps_may_have_coordinates_and_samplers_of_their_own(tmp_path):
     assert np.isfinite(rts.render(part, camera, (8, 8))).all()
 
 
-def test_a_map_without_its_coordinates_is_left_out(tmp_path):
+def test_a_map_without_its_coordinates_becomes_its_mean(tmp_path):
     material = {
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
         "normalTexture": {"index": 0},
         "occlusionTexture": {"index": 0, "texCoord": 1},
     }
     path = model(tmp_path, material, [GREY])
-    [part] = rts.load(path)
-    assert "normal_map" in part.theta and not {"occlusion", "uv_occlusion"} & {*part.theta}
+    with pytest.warns(
+        rts.errors.FileWarning, match="has maps without their coordinates, whose mean is taken: the occl"
+    ):
+        [part] = rts.load(path)
+    assert "normal_map" in part.theta and "uv_occlusion" not in part.theta
+    np.testing.assert_allclose(part.theta["occlusion"], [51 / 255], atol=1e-6)
+    camera = rts.Camera.look_at((0.3, 0.3, 3), (0.3, 0.3, 0))
+    assert np.isfinite(rts.render(part, camera, (8, 8))).all()
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_merged_parts_of_different_materials_drop_how_maps_were_looked_up(tmp_path, textured):
+    look = {"baseColorTexture": {"index": 0}} if textured else {}
+    occlusion = {"occlusionTexture": {"index": 1, "texCoord": 1}}
+    first = {"pbrMetallicRoughness": {**look, "metallicRoughnessTexture": {"index": 0}}, **occlusion}
+    path = model(tmp_path, first, [GREY, GREY], more={"samplers": [{}, {"wrapS": 33071}]}, TEXCOORD_1=CORNERS[:, :2])
+    tree = json.loads(path.read_text())
+    tree["materials"].append({**first, "pbrMetallicRoughness": {**look, "metallicFactor": 0.5}})
+    tree["meshes"].append({"primitives": [tree["meshes"][0]["primitives"][0] | {"material": 1}]})
+    tree["nodes"].append({"mesh": 1, "translation": [2, 0, 0]})
+    tree["scenes"] = [{"nodes": [0, 1]}]
+    path.write_text(json.dumps(tree))
+    with pytest.warns(rts.errors.FileWarning, match="different materials"):
+        [part] = rts.load(path, merge=True)
+    assert not [name for name in part.theta if name.startswith("uv_")] and "occlusion" not in part.theta
 
 
 def test_what_is_not_followed_is_one_warning_that_names_it(tmp_path):

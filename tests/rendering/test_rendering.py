@@ -594,6 +594,15 @@ def test_shaders_that_do_not_say_what_they_read_are_not_spoken_of():
         assert rts.explain(part, CAMERA)[0].remarks == ()
 
 
+def test_coordinates_of_a_map_that_no_surface_declares_are_warned_of():
+    theta = {"vertices": BOX[0], "uv_occlusion": np.ones((len(BOX[0]), 2), np.float32)}
+    with pytest.warns(
+        rts.errors.InputWarning, match=r"declare it, such as by rts.Mesh\(faces, {'uv_occlusion': None}\)"
+    ):
+        rts.render(Part(Mesh(BOX[1]), theta, "pbr"), CAMERA, SIZE)
+    rts.render(Part(Mesh(BOX[1], {"uv_occlusion": None}), theta, "pbr"), CAMERA, SIZE)
+
+
 @pytest.mark.parametrize("target", ALL)
 def test_explain_at_a_size_observes_what_functions_read(target):
     def shader(theta, gbuffer, camera):

@@ -209,7 +209,16 @@ def test_a_map_with_coordinates_of_its_own_is_looked_up_there_by_its_own_sampler
         assert abs(shader(theta, GBuffer(gbuffer | {"uv": uv}), CAMERA) - expected).max() > 0.1
 
 
-@pytest.mark.parametrize("wrong", ["clamp", (("occlusion", "clamp"),), (("colour", "clamp", "linear"),)])
+def test_coordinates_of_a_map_are_two_numbers():
+    points, _ = ball()
+    gbuffer = GBuffer(position=points, normal=points, uv_occlusion=points)
+    with pytest.raises(InputError, match=r"the surface's 'uv_occlusion' has shape .*; expected \(N, 2\)"):
+        Pbr()({"occlusion": np.ones((2, 2, 1))}, gbuffer, CAMERA)
+
+
+@pytest.mark.parametrize(
+    "wrong", ["clamp", (("occlusion", "clamp"),), (("colour", "clamp", "linear"),), ((3, "clamp", "linear"),)]
+)
 def test_wrong_samplers_are_refused(wrong):
     with pytest.raises(InputError, match="expected a tuple of \\(name, wrap, filter\\)"):
         Pbr(samplers=wrong)

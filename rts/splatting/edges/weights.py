@@ -203,7 +203,9 @@ def normal_equations(
             _push_outlines(operands, tangents, outlines, kept, image)
         else:
             push(operands, tangents, image, kept)
-        changes = np.add.reduceat(flat[cells], first, axis=0) / side**2 if len(first) else flat[:0]
+        changes = flat[cells]
+        if side > 1 and len(first):
+            changes = np.add.reduceat(changes, first, axis=0) / side**2
         jacobian[i] = compared(changes, 0.0, pixels).reshape(-1)
         flat[cells] = 0.0
     here, size = r[pixels].reshape(-1), r.size
