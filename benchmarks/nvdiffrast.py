@@ -232,7 +232,7 @@ def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
 
 
 def gradient(shape: trimesh.Trimesh, colored: bool, seed: int, size: int = 256) -> float:
-    """Percent by which the gradient of a loss in a pose is off differences of `rts.render` with 4 × 4 samples a pixel.
+    """Percent by which the gradient of a loss in a pose is off differences of `rts.render` with 8 × 8 samples a pixel.
 
     The loss is the squared distance from the image of another pose, of a mask, or of normals as colours. Steps move
     edges by a fiftieth of a pixel: over half a pixel, the derivative of an edge that is almost level changes much.
@@ -243,7 +243,7 @@ def gradient(shape: trimesh.Trimesh, colored: bool, seed: int, size: int = 256) 
     points, faces = torch.tensor(np.array(shape.vertices)).float(), torch.tensor(np.array(shape.faces)).int()
     normals = torch.tensor(np.array(shape.vertex_normals)).float()
     colors = 0.5 + 0.5 * normals if colored else torch.ones(len(points), 3)
-    areas = by_rts(samples=4, faces=faces)
+    areas = by_rts(samples=8, faces=faces)
 
     def image(pose):
         pos = clip(points, rts.rigid(pose).float())

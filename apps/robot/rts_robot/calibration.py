@@ -115,19 +115,20 @@ def calibrate(
     else:
         check_numbers("start", start, (4, 4))
         starts = [np.linalg.inv(np.asarray(start, np.float64))]
-    problems = [_Problem(robot, masks, values, intrinsics, view, (), robust) for view in starts]
+    problems = [_Problem(robot, masks, values, intrinsics, view, (), robust, apart=True) for view in starts]
     fits = [problem.fitted(COARSE, progress) for problem in problems]
     best = min(range(len(fits)), key=lambda n: fits[n].loss)
     view = problems[best].view_at(fits[best].parameters)
+    near = _Problem(robot, masks, values, intrinsics, view, offsets, robust, apart=True).fitted(MIDDLE, progress)
     problem = _Problem(robot, masks, values, intrinsics, view, offsets, robust)
-    fit = problem.fitted(FULL, progress, problem.fitted(MIDDLE, progress).parameters)
+    fit = problem.fitted(FULL, progress, near.parameters)
     view = problem.view_at(fit.parameters)
     found = fit.parameters["offsets"].numpy().astype(np.float64) if offsets else np.zeros(0)
     moved = values + found @ problem.chosen
     final = _Problem(robot, masks, moved, intrinsics, view, offsets, robust)
     covariance, camera = final.covariance(), final.camera
     deviations = np.sqrt(np.diag(covariance)[6:])
-    ious = np.array([_iou(robot.parts(q), camera, mask) for q, mask in zip(moved, masks, strict=True)])
+    ious = np.array([_iou(robot.silhouette(q), camera, mask) for q, mask in zip(moved, masks, strict=True)])
     return Calibration(
         np.linalg.inv(view),
         covariance[:6, :6],
@@ -148,6 +149,9 @@ class _Problem:
     Parameters are `turn` (3,), a rotation vector about the robot's middle, radians, `shift` (3,), metres, and perhaps
     `offsets`: numbers of one array ought to be of like units.
 
+    The robot is one part, which takes less time, or its links are parts: `apart`. Coarse stages keep them apart, since
+    a start far off was lost with one part.
+
     Attributes:
         camera: the camera at `view`.
         chosen: (k, J), 1 where an offset is added to a value.
@@ -162,6 +166,7 @@ class _Problem:
         view: np.ndarray,
         offsets: Sequence[str],
         loss: rts.Loss,
+        apart: bool = False,
     ):
         self.size = masks.shape[1:]
         turn = Rotation.from_matrix(view[:3, :3]).as_matrix()  # The nearest one: matrices of files are rounded.
@@ -170,9 +175,10 @@ class _Problem:
         self.middle = placed[:, [mesh.link for mesh in robot.meshes], :3, 3].mean(axis=(0, 1))
         self.chosen = np.array([[name == other for other in robot.names] for name in offsets], np.float64)
         self.chosen = self.chosen.reshape(len(offsets), len(robot.names))
-        self._robot, self._values, self._masks = robot, values, np.asarray(masks, np.float32)
+        self._values, self._masks = values, np.asarray(masks, np.float32)
         self._offsets, self._loss = offsets, loss
-        self._still = [robot.parts(q) for q in values]
+        self._parts = robot.parts if apart else lambda q: [robot.silhouette(q)]
+        self._still = [self._parts(q) for q in values]
         self._start = {"turn": torch.zeros(3), "shift": torch.zeros(3)}
         if len(offsets):
             self._start["offsets"] = torch.zeros(len(offsets))
@@ -184,7 +190,7 @@ class _Problem:
             return self._still[number], moved
         offsets = parameters["offsets"]
         values = torch.as_tensor(self._values[number], dtype=offsets.dtype)
-        return self._robot.parts(values + offsets @ torch.as_tensor(self.chosen, dtype=offsets.dtype)), moved
+        return self._parts(values + offsets @ torch.as_tensor(self.chosen, dtype=offsets.dtype)), moved
 
     def fitted(self, stage: rts.Stage, progress: bool | None, start: Any = None) -> Any:
         """The fit of the parameters, from `start` or zero on."""
@@ -223,8 +229,8 @@ class _Problem:
         return change @ covariance @ change.T
 
 
-def _iou(parts: list[rts.Part], camera: rts.Camera, mask: np.ndarray) -> float:
-    drawn = np.asarray(rts.render(parts, camera, mask.shape, layers=1))[..., 3] >= 0.5
+def _iou(part: rts.Part, camera: rts.Camera, mask: np.ndarray) -> float:
+    drawn = np.asarray(rts.render(part, camera, mask.shape, layers=1))[..., 3] >= 0.5
     inside = median_filter(mask, 3) >= 0.5  # Without lone wrong pixels.
     return float(np.count_nonzero(drawn & inside) / max(np.count_nonzero(drawn | inside), 1))
 

@@ -51,6 +51,9 @@ class Robot(Kinematics):
         self.meshes = meshes
         self._surfaces = [rts.Mesh(mesh.faces) for mesh in meshes]
         self._silhouettes = [rts.Mesh(mesh.silhouette[1]) for mesh in meshes]
+        begins = np.cumsum([0, *(len(mesh.silhouette[0]) for mesh in meshes)])
+        faces = [mesh.silhouette[1] + begin for mesh, begin in zip(meshes, begins, strict=False)]
+        self._whole = rts.Mesh(np.concatenate(faces))
 
     def parts(self, values: Any, shader: Any = "silhouette") -> list[rts.Part]:
         """A part for each link that has meshes, in the frame of the base; differentiable in the values.
@@ -69,6 +72,22 @@ class Robot(Kinematics):
             theta = {"vertices": mesh.silhouette[0]} if plain else {"vertices": mesh.vertices, "colors": mesh.colors}
             parts.append(rts.Part(surface, theta, shader, transform=placed[mesh.link]))
         return parts
+
+    def silhouette(self, values: Any) -> rts.Part:
+        """The robot as one part with the shader "silhouette", which takes less time than a part for each link.
+
+        Args:
+            values: as in `parts`.
+
+        Raises:
+            rts.InputError: as in `parts`.
+        """
+        placed, moved = self.transforms(values), []
+        engine = rts.engine_of(placed[0])
+        for mesh in self.meshes:
+            vertices, matrix = engine.constant(mesh.silhouette[0], placed[0]), placed[mesh.link]
+            moved.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+        return rts.Part(self._whole, {"vertices": engine.namespace.concat(moved)}, "silhouette")
 
 
 def load_urdf(path: Any, packages: Any = None) -> Robot:

@@ -87,19 +87,23 @@ def test_silhouettes_are_those_of_the_shaded_parts(path):
     ]
     np.testing.assert_allclose(*images, atol=1e-5)
     assert 0.02 < images[0].mean() < 0.5
+    whole = rts.render(robot.silhouette(VALUES[1]), camera, (40, 40))[..., 3]
+    assert np.abs(whole - images[0]).mean() < 1e-3  # Outlines differ slightly where links touch.
 
 
-def test_a_rendering_of_joints_has_the_slope_of_area_samples(path):
+@pytest.mark.parametrize("name", ["parts", "silhouette"])
+def test_a_rendering_of_joints_has_the_slope_of_area_samples(path, name):
     torch = pytest.importorskip("torch")
     robot, q, step = load_urdf(path), VALUES[1], 0.02
+    drawn = getattr(robot, name)
     camera = rts.Camera.look_at((1.6, -1.5, 1.0), (0.3, 0.1, 0.0), (0, 0, 1))
     weights = np.linspace(0, 1, 96)  # So that a link that turns without a change of its area counts, too.
 
     def moment(values):
-        return (rts.render(robot.parts(values), camera, (96, 96), supersample=4)[..., 3] * weights).mean()
+        return (rts.render(drawn(values), camera, (96, 96), supersample=4)[..., 3] * weights).mean()
 
     values = torch.tensor(q, dtype=torch.float32, requires_grad=True)
-    (rts.render(robot.parts(values), camera, (96, 96))[..., 3] * torch.tensor(weights)).mean().backward()
+    (rts.render(drawn(values), camera, (96, 96))[..., 3] * torch.tensor(weights)).mean().backward()
     for number, tolerance in ((0, 0.05), (2, 0.08)):  # The shoulder, and the slide.
         change = step * np.eye(len(q))[number]
         slope = (moment(q + change) - moment(q - change)) / (2 * step)
