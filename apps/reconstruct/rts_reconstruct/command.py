@@ -36,6 +36,7 @@ def reconstruct(
     light: Annotated[
         bool, typer.Option("--light", help="Tell light from colours, and write colours as in even light.")
     ] = False,
+    trim: Annotated[bool, typer.Option("--trim", help="Cut away the surface that no picture sees.")] = False,
     background: Annotated[
         str | None, typer.Option(help="R,G,B from 0 to 1, of pictures without alpha and masks; else that of borders.")
     ] = None,
@@ -75,6 +76,7 @@ def reconstruct(
             held_out=held_out,
             fit_cameras=fit_cameras,
             light=light,
+            trim=trim,
             background=None if background is None else _numbers("--background", background, "three", "1,1,1"),
             masks=masks,
             region=None if region is None else _numbers("--region", region, "four", "0,0,0,1"),

@@ -40,6 +40,7 @@ def reconstruct(
     held_out: int = 8,
     fit_cameras: bool = False,
     light: bool = False,
+    trim: bool = False,
     background: Any = None,
     masks: Any = "object",
     region: Any = None,
@@ -82,6 +83,8 @@ def reconstruct(
         light: True to tell light and colours apart in the end, and write colours as in even light, and the light. It is
             one environment, of spherical harmonics to the second order, whose mean irradiance is 1, since pictures do
             not tell bright light from bright colours. Near points are taken to be of one material, but for edges.
+        trim: True to cut away the surface that no picture which is fitted sees; it is filled from beside otherwise.
+            Patches of less than a thousandth of the surface stay, so that creases get no holes.
         background: (3,) encoded colour of pictures without alpha and masks; None for that of their borders.
         masks: "object" for masks that are white where the object is; "ignore" for masks that are black where pixels do
             not count, as COLMAP has them; or a folder of masks such as this function writes, white, black, and grey.
@@ -152,7 +155,7 @@ def reconstruct(
     finally:
         if run.watch is not None:
             run.watch.end()
-    return run.finish(light)
+    return run.finish(light, trim)
 
 
 def _notes(shots: pictures.Pictures, folder: Path, consistent: float) -> list[str]:

@@ -156,8 +156,8 @@ class Run:
                 self.files = files.write_mesh(self.folder, model, self.pictures)
                 self.saved.write(model, self.losses, self.seconds, self.pictures.exposures)
 
-    def finish(self, light: bool) -> Reconstruction:
-        """Add detail, tell light from colours if asked to, measure all views, and write the rest."""
+    def finish(self, light: bool, trim: bool) -> Reconstruction:
+        """Add detail, tell light from colours and cut the unseen away if asked to, measure views, write the rest."""
         if self.settings.cameras and self.pictures.held_out:
             held_out = range(len(self.pictures.views), len(self.pictures.numbers))
             self.model = posing.posed(self.model, self.pictures, self.settings, held_out)
@@ -167,9 +167,11 @@ class Run:
         self.model = job.shared(lambda: detail.detailed(self.model, self.pictures))
         if light:
             self.model = job.shared(lambda: texturing.in_even_light(self.model))
+        unseen, cut = sight.unseen_share(self.model, known), 0.0
+        if trim:
+            self.model, known, cut = job.shared(lambda: sight.trimmed(self.model, known))
         rows = job.shared(lambda: measures.measured(self.model, self.pictures))  # The verdict's fits follow from them.
-        unseen = sight.unseen_share(self.model, known)
-        told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings)
+        told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings, cut)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
         found = Reconstruction(self.model, self.pictures, rows, psnr, self.seconds, [], told)
