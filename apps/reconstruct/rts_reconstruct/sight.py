@@ -91,7 +91,7 @@ def trimmed(model: Model, known: np.ndarray) -> tuple[Model, np.ndarray, float]:
 def _hidden(model: Model, known: np.ndarray) -> np.ndarray:
     """True for faces (T,) whose corners no view sees, but for patches that are specks."""
     mesh = trimesh.Trimesh(model.vertices, model.faces, process=False)
-    found = ~known[model.faces].any(axis=1)
+    found = ~np.asarray(known[model.faces].any(axis=1))
     pairs = mesh.face_adjacency
     same = found[pairs[:, 0]] == found[pairs[:, 1]]
     labels = trimesh.graph.connected_component_labels(pairs[same], node_count=len(found))
