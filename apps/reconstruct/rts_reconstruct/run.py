@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -88,9 +91,11 @@ class Run:
         model: Model,
         folder: Path,
         first: bool,
+        finer: Callable[[], pictures.Pictures],
     ):
         self.pictures, self.settings, self.saved, self.watch = shots, settings, saved, watch
         self._taken = shots  # As they are, in whatever exposure.
+        self._read_finer = finer
         self.model, self.folder, self.first = model, folder, first
         self.losses: list[list[float]] = []
         self.files: list[Path] = []
@@ -130,7 +135,17 @@ class Run:
         if self.stopped:
             self._keep(model, [])
             return
-        self._keep(*texturing.fitted(model, known, self.pictures, steps, self.settings, *self._reporting(number)))
+        self._keep(*texturing.fitted(model, known, self._finer, steps, self.settings, *self._reporting(number)))
+
+    @functools.cached_property
+    def _finer(self) -> pictures.Pictures:
+        """Larger pictures, if there are any, for the texture: its shape is known."""
+        shots = self.pictures
+        if all(a.size == b.size for a, b in zip(shots.given, shots.views, strict=False)):
+            return shots
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rts.errors.RtsWarning)  # The smaller ones have warned.
+            return evened(self._read_finer(), shots.exposures)
 
     def _reporting(self, number: int) -> tuple[Path, Any]:
         """The file of a stage's fit, and its callback."""
@@ -164,7 +179,8 @@ class Run:
         known = job.shared(lambda: sight.seen(self.model, self.pictures))
         if self.model.atlas is None:
             self.model = sight.filled(self.model, known)
-        self.model = job.shared(lambda: detail.detailed(self.model, self.pictures))
+        else:
+            self.model = job.shared(lambda: detail.detailed(self.model, self._finer))
         if light:
             self.model = job.shared(lambda: texturing.in_even_light(self.model))
         unseen, cut = sight.unseen_share(self.model, known), 0.0

@@ -113,6 +113,21 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
 
 
 @pytest.mark.thorough
+def test_the_texture_is_fitted_to_pictures_of_twice_the_size(tmp_path, monkeypatch):
+    sizes, fitted = [], rts_reconstruct.texturing.fitted
+
+    def noted(model, known, pictures, *rest):
+        sizes.extend(view.size for view in pictures.views)
+        return fitted(model, known, pictures, *rest)
+
+    monkeypatch.setattr(rts_reconstruct.texturing, "fitted", noted)
+    options = TINY | {"size": SIZE // 4}
+    found = rts_reconstruct.reconstruct(views(), tmp_path, **options)
+    assert {view.size for view in found.pictures.views} == {(SIZE // 4, SIZE // 4)}
+    assert sizes == [(SIZE // 2, SIZE // 2)] * len(found.pictures.views)
+
+
+@pytest.mark.thorough
 def test_what_pictures_from_above_do_not_see_is_cut_away(tmp_path):
     options = TINY | {"held_out": 0, "steps": 30}
     above = rts_reconstruct.reconstruct(views()[:4], tmp_path, **options)
