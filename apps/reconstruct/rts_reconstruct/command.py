@@ -26,7 +26,10 @@ def reconstruct(
     ] = None,
     surface: Annotated[str, typer.Option(help="mesh; isosurface: holes may open; or subdivision: smooth.")] = "mesh",
     steps: Annotated[int | None, typer.Option(help="Steps of the shape; 1300.", show_default=False)] = None,
-    size: Annotated[int | None, typer.Option(help="Longer side of pictures, at most; 256, and for a texture 512.", show_default=False)] = None,
+    size: Annotated[
+        int | None,
+        typer.Option(help="Longer side of pictures, at most; 256, and for a texture 512.", show_default=False),
+    ] = None,
     batch: Annotated[int, typer.Option(help="Pictures in a step.")] = 4,
     texture: Annotated[
         int | None, typer.Option(help="Texels a side; 1024. 0 for vertex colours.", show_default=False)
