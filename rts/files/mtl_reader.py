@@ -12,14 +12,15 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files.bump_maps import holds_normals, normals_of_heights
-from rts.files.damaged_files import contents, lines_of
+from rts.files.damaged_files import contents, lines_of, warn
 from rts.files.images import read_texture
 from rts.files.paths import inside
 from rts.files.srgb import decode_srgb
 
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
-_MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+# What follows -bm is its value, whatever it is, unless that leaves no name.
+_MAP_OPTIONS = re.compile(rf"^(?:(?:-bm\s+(?!-[a-z])\S+\s+(?=\S)|-[a-z]+\s+)(?:{_VALUE}\s+)*)+", re.IGNORECASE)
 _OPTION = re.compile(r"(-[a-z]+)\s+((?:[^-\s]\S*\s+|-[\d.]\S*\s+)*)", re.IGNORECASE)
 _USUAL = {"-s": {1.0}, "-o": {0.0}, "-t": {0.0}, "-bm": {1.0}, "-mm": {0.0, 1.0}}
 """Options of numbers → those that change nothing."""
@@ -158,7 +159,7 @@ def _options(rest: str) -> list[tuple[str, list[str]]]:
 
 
 def _multiplier(library: Path, number: int, rest: str) -> float:
-    """The number of the option -bm in a map statement, 1 without one; refused where it is none, or too large."""
+    """The number of the option -bm in a map statement; 1 without one, and, with a warning, where it is bad."""
     multiplier = 1.0
     for words in (words for name, words in _options(rest) if name == "-bm"):
         try:
@@ -166,9 +167,10 @@ def _multiplier(library: Path, number: int, rest: str) -> float:
         except ValueError:
             multiplier = np.inf
         if not abs(multiplier) <= STEEPEST:
-            raise InputError(
-                f"{library}, line {number}: -bm is {' '.join(words)[:60]!r} in {rest[:60]!r}; expected one number "
-                f"from {-STEEPEST:g} to {STEEPEST:g}"
+            multiplier = 1.0
+            warn(
+                f"{library}, line {number}: -bm is {' '.join(words)[:60]!r} in {rest[:60]!r}, not one number from "
+                f"{-STEEPEST:g} to {STEEPEST:g}; it is taken for 1"
             )
     return multiplier
 

@@ -26,7 +26,10 @@ def reconstruct(
     ] = None,
     surface: Annotated[str, typer.Option(help="mesh; isosurface: holes may open; or subdivision: smooth.")] = "mesh",
     steps: Annotated[int | None, typer.Option(help="Steps of the shape; 1300.", show_default=False)] = None,
-    size: Annotated[int | None, typer.Option(help="Longer side of pictures, at most; 256.", show_default=False)] = None,
+    size: Annotated[
+        int | None,
+        typer.Option(help="Longer side of pictures, at most; 256, and for a texture 512.", show_default=False),
+    ] = None,
     batch: Annotated[int, typer.Option(help="Pictures in a step.")] = 4,
     texture: Annotated[
         int | None, typer.Option(help="Texels a side; 1024. 0 for vertex colours.", show_default=False)
@@ -36,6 +39,7 @@ def reconstruct(
     light: Annotated[
         bool, typer.Option("--light", help="Tell light from colours, and write colours as in even light.")
     ] = False,
+    trim: Annotated[bool, typer.Option("--trim", help="Cut away the surface that no picture sees.")] = False,
     background: Annotated[
         str | None, typer.Option(help="R,G,B from 0 to 1, of pictures without alpha and masks; else that of borders.")
     ] = None,
@@ -75,6 +79,7 @@ def reconstruct(
             held_out=held_out,
             fit_cameras=fit_cameras,
             light=light,
+            trim=trim,
             background=None if background is None else _numbers("--background", background, "three", "1,1,1"),
             masks=masks,
             region=None if region is None else _numbers("--region", region, "four", "0,0,0,1"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from rts_reconstruct.starts import start as starting_mesh
 STEPS, SIZE, TEXTURE = 1300, 256, 1024
 QUICK = {"steps": 240, "size": 128, "texture": 512, "faces": 0.25}
 """What `quick` makes of the defaults; `faces` is a factor."""
+FINER = 2
+"""Pixels of pictures that the texture is fitted to, along each side, for one of those of the shape."""
 TEXTURE_SHARE = 0.2
 """Steps of the texture, as a share of those of the shape."""
 GREY = 0.5
@@ -40,6 +43,7 @@ def reconstruct(
     held_out: int = 8,
     fit_cameras: bool = False,
     light: bool = False,
+    trim: bool = False,
     background: Any = None,
     masks: Any = "object",
     region: Any = None,
@@ -72,7 +76,7 @@ def reconstruct(
             and a last one that fits the mesh of it; or "subdivision", for stages that fit the cage of a Loop
             subdivision surface, which is smooth between its fewer control points. The files hold a fine mesh of it.
         steps: the steps of all stages of the shape, by default 1300; the texture takes a fifth as many on top.
-        size: pixels; longer sides of pictures are made at most so long, by default 256.
+        size: pixels; longer sides of pictures are made at most so long, by default 256, and twice so for the texture.
         batch: the number of pictures in a step.
         texture: texels a side, by default 1024; 0 for vertex colours.
         held_out: every so many views, one is held out and only measured; 0 for none.
@@ -82,6 +86,8 @@ def reconstruct(
         light: True to tell light and colours apart in the end, and write colours as in even light, and the light. It is
             one environment, of spherical harmonics to the second order, whose mean irradiance is 1, since pictures do
             not tell bright light from bright colours. Near points are taken to be of one material, but for edges.
+        trim: True to cut away the surface that no picture which is fitted sees; it is filled from beside otherwise.
+            Patches of less than a thousandth of the surface stay, so that creases get no holes.
         background: (3,) encoded colour of pictures without alpha and masks; None for that of their borders.
         masks: "object" for masks that are white where the object is; "ignore" for masks that are black where pixels do
             not count, as COLMAP has them; or a folder of masks such as this function writes, white, black, and grey.
@@ -117,7 +123,10 @@ def reconstruct(
     first = job.join()
     views = job.shared(lambda: with_cameras(views, folder / "photographs"))
     masks, region = checked_masks(masks), checked_region(region)
-    shots = pictures.read(views, size, held_out, background, masks, region, start)
+    read = functools.partial(
+        pictures.read, views, held_out=held_out, background=background, masks=masks, region=region, start=start
+    )
+    shots = read(size=size)
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
@@ -142,7 +151,7 @@ def reconstruct(
     identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
     identity |= {"masks": str(masks), "region": region}
     saved = Saved(folder / "checkpoint", identity)
-    run = Run(shots, settings, saved, watch if first else None, model, folder, first)
+    run = Run(shots, settings, saved, watch if first else None, model, folder, first, lambda: read(size=FINER * size))
     run.begin(resume)
     try:
         for number, (stage, count) in enumerate(plan):
@@ -152,7 +161,7 @@ def reconstruct(
     finally:
         if run.watch is not None:
             run.watch.end()
-    return run.finish(light)
+    return run.finish(light, trim)
 
 
 def _notes(shots: pictures.Pictures, folder: Path, consistent: float) -> list[str]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -88,9 +91,11 @@ class Run:
         model: Model,
         folder: Path,
         first: bool,
+        finer: Callable[[], pictures.Pictures],
     ):
         self.pictures, self.settings, self.saved, self.watch = shots, settings, saved, watch
         self._taken = shots  # As they are, in whatever exposure.
+        self._read_finer = finer
         self.model, self.folder, self.first = model, folder, first
         self.losses: list[list[float]] = []
         self.files: list[Path] = []
@@ -130,7 +135,17 @@ class Run:
         if self.stopped:
             self._keep(model, [])
             return
-        self._keep(*texturing.fitted(model, known, self.pictures, steps, self.settings, *self._reporting(number)))
+        self._keep(*texturing.fitted(model, known, self._finer, steps, self.settings, *self._reporting(number)))
+
+    @functools.cached_property
+    def _finer(self) -> pictures.Pictures:
+        """Larger pictures, if there are any, for the texture: its shape is known."""
+        shots = self.pictures
+        if all(a.size == b.size for a, b in zip(shots.given, shots.views, strict=False)):
+            return shots
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rts.errors.RtsWarning)  # The smaller ones have warned.
+            return evened(self._read_finer(), shots.exposures)
 
     def _reporting(self, number: int) -> tuple[Path, Any]:
         """The file of a stage's fit, and its callback."""
@@ -156,20 +171,23 @@ class Run:
                 self.files = files.write_mesh(self.folder, model, self.pictures)
                 self.saved.write(model, self.losses, self.seconds, self.pictures.exposures)
 
-    def finish(self, light: bool) -> Reconstruction:
-        """Add detail, tell light from colours if asked to, measure all views, and write the rest."""
+    def finish(self, light: bool, trim: bool) -> Reconstruction:
+        """Add detail, tell light from colours and cut the unseen away if asked to, measure views, write the rest."""
         if self.settings.cameras and self.pictures.held_out:
             held_out = range(len(self.pictures.views), len(self.pictures.numbers))
             self.model = posing.posed(self.model, self.pictures, self.settings, held_out)
         known = job.shared(lambda: sight.seen(self.model, self.pictures))
         if self.model.atlas is None:
             self.model = sight.filled(self.model, known)
-        self.model = job.shared(lambda: detail.detailed(self.model, self.pictures))
+        else:
+            self.model = job.shared(lambda: detail.detailed(self.model, self._finer))
         if light:
             self.model = job.shared(lambda: texturing.in_even_light(self.model))
+        unseen, cut = sight.unseen_share(self.model, known), 0.0
+        if trim:
+            self.model, known, cut = job.shared(lambda: sight.trimmed(self.model, known))
         rows = job.shared(lambda: measures.measured(self.model, self.pictures))  # The verdict's fits follow from them.
-        unseen = sight.unseen_share(self.model, known)
-        told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings)
+        told = verdict(self.model, self.pictures, rows, self.losses, unseen, self.settings, cut)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
         found = Reconstruction(self.model, self.pictures, rows, psnr, self.seconds, [], told)

@@ -13,6 +13,8 @@ from rts_reconstruct.pictures import Pictures
 
 FACING = 0.1
 """The least cosine between a normal and the way to a camera that sees the surface."""
+SPECK = 0.001
+"""Patches, seen or not, of less than this share of the surface are cut or kept with what surrounds them."""
 
 
 def camera_of(model: Model, pictures: Pictures, place: int, camera: rts.Camera) -> rts.Camera:
@@ -66,3 +68,40 @@ def unseen_share(model: Model, known: np.ndarray) -> float:
     """The share of the surface whose corners no view sees."""
     areas = trimesh.Trimesh(model.vertices, model.faces, process=False).area_faces
     return float(areas[~known[model.faces].any(axis=1)].sum() / max(areas.sum(), 1e-12))
+
+
+def trimmed(model: Model, known: np.ndarray) -> tuple[Model, np.ndarray, float]:
+    """The model without faces that no view sees, `known` for the vertices that stay, and the share that is cut away.
+
+    A model that no view sees at all stays whole.
+    """
+    away = _hidden(model, known)
+    if away.all():
+        return model, known, 0.0
+    areas = trimesh.Trimesh(model.vertices, model.faces, process=False).area_faces
+    used, faces = _rest(model.faces[~away])
+    atlas = model.atlas
+    if atlas is not None:
+        rows, corners = _rest(atlas.faces[~away])
+        atlas = atlas._replace(uv=atlas.uv[rows], faces=corners)
+    rest = model._replace(vertices=model.vertices[used], faces=faces, colors=model.colors[used], atlas=atlas)
+    return rest, known[used], float(areas[away].sum() / max(areas.sum(), 1e-12))
+
+
+def _hidden(model: Model, known: np.ndarray) -> np.ndarray:
+    """True for faces (T,) whose corners no view sees, but for patches that are specks."""
+    mesh = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    found = ~np.asarray(known[model.faces].any(axis=1))
+    pairs = mesh.face_adjacency
+    same = found[pairs[:, 0]] == found[pairs[:, 1]]
+    labels = trimesh.graph.connected_component_labels(pairs[same], node_count=len(found))
+    areas = np.bincount(labels, mesh.area_faces)
+    specks = areas < SPECK * areas.sum()
+    specks &= np.isin(np.arange(len(areas)), labels[pairs[~same]])  # A small piece that stands alone is none.
+    return found ^ specks[labels]
+
+
+def _rest(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that faces (T, 3) use, and the faces between these rows."""
+    rows, corners = np.unique(faces, return_inverse=True)
+    return rows, corners.reshape(-1, 3).astype(np.int32)

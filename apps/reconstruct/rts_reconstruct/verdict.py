@@ -60,6 +60,7 @@ def verdict(
     losses: Sequence[Sequence[float]],
     unseen: float,
     settings: Settings,
+    cut: float = 0.0,
 ) -> Verdict:
     """The verdict on a model.
 
@@ -70,6 +71,7 @@ def verdict(
         losses: of each stage.
         unseen: the share of the surface that no view sees.
         settings: of the fit.
+        cut: the share of the surface that was cut away, since no view sees it.
     """
     psnr = mean_of(list(rows), "psnr", bool(pictures.held_out)) or 0.0
     overlap = mean_of(list(rows), "iou", False)
@@ -82,6 +84,8 @@ def verdict(
     if away is not None:
         figures += f", points off by {away[0]:.2f} % of the diagonal, 90th percentile {away[1]:.2f} %"
     figures += f", {100 * unseen:.0f} % of the surface unseen"
+    if cut:
+        figures += f", {100 * cut:.0f} % cut away"
     if pictures.exposures is not None:
         figures += f", exposures that differ by {100 * pictures.exposures.std():.0f} % evened out"
     blob = psnr < PSNR or (overlap is not None and overlap < OVERLAP) or (away is not None and away[1] > AWAY)
@@ -99,14 +103,15 @@ def verdict(
         findings.append(f"the loss has not fallen ({first:.2g} → {last:.2g}): give more --steps, or another --start")
     findings += _disagreeing(model, pictures, rows, settings)
     angle = points.span(pictures.views, np.zeros(3))
+    fate = "cut away" if cut else "made up"
     if angle < FRONT:
         findings.append(
             f"the cameras are within {angle:.0f}° and do not surround a thing: this is a front, and what is behind it "
-            "is made up; take pictures from all around"
+            f"is {fate}; take pictures from all around"
         )
     elif unseen > UNSEEN:
         where = "" if angle >= AROUND else f", and cameras are within {angle:.0f}° of one another"
-        findings.append(f"much of the surface is in no picture{where}: what faces away from them is made up")
+        findings.append(f"much of the surface is in no picture{where}: what faces away from them is {fate}")
     return Verdict(blob, figures, tuple(findings))
 
 

@@ -224,6 +224,36 @@ def test_colours_that_no_view_sees_come_from_beside():
     assert sight.unseen_share(model, known) == pytest.approx(0.5, abs=0.2)
 
 
+def test_what_no_view_sees_of_a_ball_is_cut_away():
+    radius, distance = 0.5, 2.0
+    ball = trimesh.creation.icosphere(5, radius=radius)
+    camera = rts.Camera.look_at((0, 0, distance), (0, 0, 0), fov_y=40, aspect=1.0)
+    image = np.ones((128, 128, 4), np.float32)
+    one = dataclasses.replace(pictures.read(views(), SIZE, 0), views=[rts.View(camera, image)])
+    model = Model(np.float32(ball.vertices), np.int32(ball.faces), np.float32(ball.vertices), np.zeros((1, 6)))
+    known = sight.seen(model, one)
+    rest, still, cut = sight.trimmed(model, known)
+    # The angle at the ball's centre where normals and ways to the camera meet at a cosine of FACING.
+    angle = np.arccos(sight.FACING) - np.arcsin(radius / distance * np.sqrt(1 - sight.FACING**2))
+    assert cut == pytest.approx((1 + np.cos(angle)) / 2, abs=0.02)
+    assert rest.vertices[:, 2].min() == pytest.approx(radius * np.cos(angle), abs=0.04)
+    assert still.sum() == known.sum() and len(rest.vertices) == len(rest.colors) == rest.faces.max() + 1
+    np.testing.assert_array_equal(rest.colors, rest.vertices)
+
+
+def test_specks_are_cut_or_kept_with_what_surrounds_them():
+    ball = trimesh.creation.icosphere(6)
+    colors, poses = np.zeros((len(ball.vertices), 3), np.float32), np.zeros((1, 6), np.float32)
+    model = Model(np.float32(ball.vertices), np.int32(ball.faces), colors, poses)
+    right = ball.vertices[:, 0] > 0
+    inward = ball.vertices @ (0.98, 0, np.sqrt(1 - 0.98**2))
+    specked = right ^ (np.abs(inward) > np.cos(0.04))  # A dark speck among what is seen, and the reverse.
+    assert (specked != right).sum() > 20
+    np.testing.assert_array_equal(sight.trimmed(model, specked)[0].vertices, sight.trimmed(model, right)[0].vertices)
+    whole, _, cut = sight.trimmed(model, np.zeros(len(right), bool))
+    assert whole is model and cut == 0
+
+
 @pytest.mark.thorough
 def test_detail_of_the_pictures_as_they_are_is_added_to_the_texture():
     fine = 256

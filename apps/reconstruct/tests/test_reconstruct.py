@@ -113,6 +113,45 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
 
 
 @pytest.mark.thorough
+def test_the_texture_is_fitted_to_pictures_of_twice_the_size(tmp_path, monkeypatch):
+    sizes, fitted = [], rts_reconstruct.texturing.fitted
+
+    def noted(model, known, pictures, *rest):
+        sizes.extend(view.size for view in pictures.views)
+        return fitted(model, known, pictures, *rest)
+
+    monkeypatch.setattr(rts_reconstruct.texturing, "fitted", noted)
+    options = TINY | {"size": SIZE // 4}
+    found = rts_reconstruct.reconstruct(views(), tmp_path, **options)
+    assert {view.size for view in found.pictures.views} == {(SIZE // 4, SIZE // 4)}
+    assert sizes == [(SIZE // 2, SIZE // 2)] * len(found.pictures.views)
+
+
+@pytest.mark.thorough
+def test_what_pictures_from_above_do_not_see_is_cut_away(tmp_path):
+    options = TINY | {"held_out": 0, "steps": 30}
+    above = rts_reconstruct.reconstruct(views()[:4], tmp_path, **options)
+    trimmed = rts_reconstruct.reconstruct(views()[:4], tmp_path, trim=True, resume=True, **options)
+    meshes = [
+        trimesh.Trimesh(found.pictures.world.outside(found.model.vertices), found.model.faces, process=False)
+        for found in (above, trimmed)
+    ]
+    assert meshes[0].is_watertight and not meshes[1].is_watertight
+    cut = 1 - meshes[1].area / meshes[0].area
+    assert 0.1 < cut < 0.5 and f", {100 * cut:.0f} % cut away" in trimmed.verdict.figures
+    assert f", {100 * cut:.0f} % cut away" in (tmp_path / "report.html").read_text()
+    rest = (meshes[1].area_faces[:, None] * meshes[1].face_normals).sum(axis=0)
+    assert rest[1] > 0.5 * np.linalg.norm(rest) > 0  # Of a closed mesh it is zero: what was cut away faced down.
+    for name in ("mesh.obj", "mesh.glb"):
+        part = rts.load(tmp_path / name)[0]
+        assert len(part.surface.faces) == len(meshes[1].faces)
+        image = np.asarray(rts.render(part.replace(shader="unlit"), cameras()[0], (SIZE, SIZE)))
+        assert np.abs(image - images()[0]).mean() < 0.1
+    with Image.open(tmp_path / "unseen.png") as unseen:
+        assert (np.asarray(unseen) > 0).mean() < 0.05
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize("surface", ["mesh", "isosurface"])
 def test_an_interrupted_run_leaves_a_mesh_and_goes_on_as_if_it_had_not_been(tmp_path, no_pause, surface):
     options = TINY | {"surface": surface}
