@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -85,14 +85,14 @@ def _piece(
     if (uv := f"TEXCOORD_{lookup.texcoord}") in read:
         attributes["uv"] = lookup.uv(read[uv].numbers()), faces
     for entry, own in material.lookups.items():
-        if own[:2] == lookup[:2]:
-            continue
-        if (uv := f"TEXCOORD_{own.texcoord}") in read:
+        if own[:2] != lookup[:2] and (uv := f"TEXCOORD_{own.texcoord}") in read:
             attributes[own_uv(entry)] = own.uv(read[uv].numbers()), faces
-        elif entries is not None:
-            gltf.note("maps without their coordinates, whose mean is taken", f"the {entry} of {name}")
-            mean = {} if entry == "normal_map" else {entry: entries[entry].mean(axis=(0, 1))}
-            entries = {key: value for key, value in entries.items() if key != entry} | mean
+    if entries is not None and (lost := [entry for entry in entries if not _placed(material, entry, read)]):
+        gltf.note("maps without their coordinates, whose mean is taken", f"the {', '.join(lost)} of {name}")
+        means = {entry: entries[entry].mean(axis=(0, 1)) for entry in lost if entry != "normal_map"}
+        entries = {entry: x for entry, x in entries.items() if entry not in lost} | means
+    if material.texture is not None and "uv" not in attributes:
+        gltf.note("textures without coordinates, which are left out", f"that of {name}")
     if other := [(entry, own.wrap, own.filter) for entry, own in material.lookups.items() if own[2:] != lookup[2:]]:
         options["samplers"] = tuple(other)
     if "TANGENT" in read and entries is not None and "normal_map" in entries:
@@ -116,3 +116,10 @@ def _piece(
         unlit=material.unlit,
         one_sided=not material.double_sided,
     )
+
+
+def _placed(material: Material, entry: str, read: Mapping[str, Accessor]) -> bool:
+    """True unless an entry of the material is a map whose coordinates are not `read`."""
+    assert material.entries is not None
+    way = material.lookups.get(entry, material.lookup)
+    return material.entries[entry].ndim < 3 or f"TEXCOORD_{way.texcoord}" in read

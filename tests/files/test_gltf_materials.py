@@ -149,8 +149,16 @@ def test_merged_parts_keep_a_material_that_all_have_or_say_that_it_goes(tmp_path
 
 def test_maps_need_uv(tmp_path):
     material = {"pbrMetallicRoughness": {"metallicFactor": 0.0}, "normalTexture": {"index": 0}}
-    [part] = rts.load(model(tmp_path, material, [np.full((1, 1, 3), 128)], uv=False))
+    with pytest.warns(
+        rts.errors.FileWarning, match="maps without their coordinates, whose mean is taken: the normal_m"
+    ):
+        [part] = rts.load(model(tmp_path, material, [np.full((1, 1, 3), 128)], uv=False))
     assert "normal_map" not in part.theta and part.theta["metallic"] == 0
+    look = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 0}, "metallicFactor": 0.5}
+    path = model(tmp_path, {"pbrMetallicRoughness": look}, [np.full((1, 1, 3), 51)], uv=False)
+    with pytest.warns(rts.errors.FileWarning, match="textures without coordinates, which are left out: that of mesh 0"):
+        [part] = rts.load(path)
+    np.testing.assert_allclose(part.theta["metallic"], [0.1], atol=1e-6)
     camera = rts.Camera.look_at((0.3, 0.3, 3), (0.3, 0.3, 0))
     assert rts.render(part, camera, (8, 8)).max() > 0
 
