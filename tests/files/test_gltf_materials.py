@@ -147,6 +147,16 @@ def test_merged_parts_keep_a_material_that_all_have_or_say_that_it_goes(tmp_path
     assert "roughness" not in part.theta
 
 
+def test_merged_primitives_of_one_material_keep_it(tmp_path):
+    look = {"baseColorTexture": {"index": 0}, "roughnessFactor": 0.3}
+    path = model(tmp_path, {"pbrMetallicRoughness": look}, [np.full((1, 1, 3), 51)])
+    tree = json.loads(path.read_text())
+    tree["meshes"][0]["primitives"] *= 2
+    path.write_text(json.dumps(tree))
+    [part] = rts.load(path, merge=True)
+    assert part.theta["roughness"] == pytest.approx(0.3)
+
+
 def test_maps_need_uv(tmp_path):
     material = {"pbrMetallicRoughness": {"metallicFactor": 0.0}, "normalTexture": {"index": 0}}
     with pytest.warns(
