@@ -5,5 +5,6 @@ from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.room import filled_up, with_room
 from rts.operations.take import take
+from rts.shading.tangents import tangent_along
 
-__all__ = ["Operation", "combine", "filled_up", "gradient", "interpolate", "take", "with_room"]
+__all__ = ["Operation", "combine", "filled_up", "gradient", "interpolate", "take", "tangent_along", "with_room"]

@@ -3,7 +3,7 @@
 from rts.shading.environment import prefiltered, turned_environment
 from rts.shading.shaders import facing_normals
 from rts.shading.spherical_harmonics import harmonics, irradiance
-from rts.shading.tangents import tangent_along, tangent_frame
+from rts.shading.tangents import tangent_frame
 from rts.shading.textures import sample_texture
 from rts.shading.tone_mapping import tonemap
 
@@ -13,7 +13,6 @@ __all__ = [
     "irradiance",
     "prefiltered",
     "sample_texture",
-    "tangent_along",
     "tangent_frame",
     "tonemap",
     "turned_environment",

@@ -10,9 +10,9 @@ import numpy as np
 
 from rts import GBuffer, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants
+from rts.plugin_api.operations import tangent_along
 from rts.plugin_api.records import Rays, Samples
 from rts.plugin_api.threads import parallel, read_only
-from rts.shading import tangent_along
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, WIDTHS, check_entry
 from rts_surfaces.patches.bicubic import normals, slopes, values
 from rts_surfaces.patches.parametric import LIMITS, Geometry, Parametric

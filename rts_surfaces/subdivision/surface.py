@@ -17,10 +17,9 @@ from numpy.typing import ArrayLike
 from rts import GBuffer, InputError, Part, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants, shape_of, unit
 from rts.plugin_api.checks import fingerprint, quoted
-from rts.plugin_api.operations import combine, filled_up, take, with_room
+from rts.plugin_api.operations import combine, filled_up, take, tangent_along, with_room
 from rts.plugin_api.records import ArraySpec, Rays, Samples
 from rts.plugin_api.threads import read_only
-from rts.shading import tangent_along
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.patches.parametric import (
     BEYOND,
