@@ -303,6 +303,8 @@ class TestPbr(ShaderOfBuiltIn):
             "color": rng.random((2, 3)),
             "position": np.array([(0.5, 2.0, 1.5)]),
             "intensity": np.array([(3.0, 2.0, 1.0)]),
+            "axis": np.array([(-0.4, -2.0, -1.3)]),
+            "cone": np.array([(0.1, 0.9)]),
             "ambient": np.array(0.1),
             "sh": np.array([3.0, *(0.3 * rng.standard_normal(15))])[:, None] * rng.uniform(0.5, 1, 3),
             "environment": rng.random((4, 8, 3)),
