@@ -35,7 +35,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import dot, shape_of
-from rts.arrays.engines import namespace, value_of
+from rts.arrays.engines import engine_of, namespace, value_of
 from rts.arrays.trees import Array, Tree
 from rts.errors import InputError
 from rts.operations.unit import unit
@@ -232,16 +232,16 @@ def _points(entries: Mapping[str, Any]) -> list[tuple[Array, Any, Any, Any]]:
                 f"theta['light']['cone'] is {quoted(cones)}; expected two angles from 0 to π, in radians, the second "
                 f"no smaller than the first"
             )
-    axes, cones = (_paired("position", positions, name, entries, CONE) for name in ("axis", "cone"))
+    default = engine_of(entries["position"]).constant(np.array(CONE), entries["position"])
+    axes, cones = (_paired("position", positions, name, entries, default) for name in ("axis", "cone"))
     return [(*pair, axis, cone) for pair, (_, axis), (_, cone) in zip(pairs, axes, cones, strict=True)]
 
 
-def _in_cone(toward: Array, axis: Array, cone: Any) -> Array:
+def _in_cone(toward: Array, axis: Array, cone: Array) -> Array:
     """The share (N, 1) of a spot light's brightness that points get, from unit vectors (N, 3) towards it."""
     xp = namespace(toward, axis)
-    inner, outer = (xp.cos(x) if hasattr(x, "dtype") else math.cos(x) for x in (cone[0], cone[1]))
-    fade = inner - outer
-    fade = xp.where(fade > LEAST_FADE, fade, LEAST_FADE) if hasattr(fade, "dtype") else max(fade, LEAST_FADE)
+    inner, outer = xp.cos(cone[0]), xp.cos(cone[1])
+    fade = xp.where(inner - outer > LEAST_FADE, inner - outer, LEAST_FADE)
     share = xp.clip((-dot(toward, unit(axis)) - outer) / fade, 0.0, 1.0)
     return xp.where(xp.any(axis != 0), share * share, xp.ones_like(share))
 

@@ -7,7 +7,7 @@ control points with weights that depend on the sample alone: linear in θ, and e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -249,7 +249,8 @@ class Subdivision(Parametric):
         (weights,) = at(VERTEX, False)
         gbuffer = GBuffer(position=combine(vertices, ids, weights))
 
-        def slopes() -> tuple[Array, Array]:
+        @cache  # For normals and tangents.
+        def slopes() -> tuple[Array, ...]:
             return tuple(combine(vertices, ids, w) for w in at(VERTEX, True))
 
         def uv(derivatives: bool) -> tuple[Array, ...]:

@@ -196,10 +196,10 @@ def normal_equations(
     cells, pixels, first = _reached(outlines, kept, row, (height, width, side, border), even)
     jacobian = np.empty((len(t_positions), len(first) * channels), rgba.dtype)
     flat = image.reshape(-1, rgba.shape[1])
-    flat[cells] = 0.0
     for i, tangent in enumerate(t_positions):
         tangents = tangent, None if t_rgba is None else t_rgba[i]
         if even:
+            flat[cells] = 0.0
             _push_outlines(operands, tangents, outlines, kept, image)
         else:
             push(operands, tangents, image, kept)
@@ -207,7 +207,6 @@ def normal_equations(
         if side > 1 and len(first):
             changes = np.add.reduceat(changes, first, axis=0) / side**2
         jacobian[i] = compared(changes, 0.0, pixels).reshape(-1)
-        flat[cells] = 0.0
     here, size = r[pixels].reshape(-1), r.size
     value = np.mean(r * r) if loss is None else loss(r.reshape(-1))
     if loss is not None and loss.robust and here.size:
