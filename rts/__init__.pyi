@@ -57,6 +57,7 @@ from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.arguments import Adaptive as Adaptive
+from rts.rendering.compiled import compiled
 from rts.rendering.image import render, render_samples
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
@@ -91,6 +92,7 @@ __all__ = [
     "View",
     "ViewResiduals",
     "check_gradient",
+    "compiled",
     "engine_of",
     "explain",
     "fit",

@@ -82,6 +82,17 @@ class Engine(Plugin):
         """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
         raise self._no_derivatives()
 
+    def compiled(self, f: Callable[..., Tree], vary: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """A function like `f` that runs as one compiled program, for `rts.compiled`. The default returns `f` itself.
+
+        Args:
+            f: trees → a tree.
+            vary: arguments → a tree like them, with True for each array whose first axis may have another length in a
+                later call.
+            options: of the compiler.
+        """
+        return f
+
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
         """The value `f(primal)` and its derivative along `tangent`, differentiable in arrays that `f` closes over."""
         raise self._no_derivatives()

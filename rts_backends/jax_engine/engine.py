@@ -162,6 +162,10 @@ class JaxEngine(Engine):
         error, self._error = self._error, None
         return error
 
+    def compiled(self, f: Callable[..., Tree], vary: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """See `Engine.compiled`: by `jax.jit`, which compiles anew for another number of samples."""
+        return jax.jit(f, **options)
+
     def stop_gradient(self, x: jax.Array) -> jax.Array:
         """`jax.lax.stop_gradient`."""
         return jax.lax.stop_gradient(x)

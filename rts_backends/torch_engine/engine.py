@@ -208,6 +208,12 @@ class TorchEngine(Engine):
         """See `Engine.split`: by `torch.split`, whose derivative is one array for all pieces."""
         return torch.split(x, list(sizes))
 
+    def compiled(self, f: Callable[..., Tree], vary: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """See `Engine.compiled`: traced by `torch.export`, compiled by `torch.compile`."""
+        from rts_backends.torch_engine.programs import Programs
+
+        return Programs(f, vary, options, self.constant)
+
     def value_and_grad(self, f: Callable) -> Callable:
         """See `Engine.value_and_grad`: by autograd on detached leaves; entries that `f` does not use get gradient 0."""
 

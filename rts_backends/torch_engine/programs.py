@@ -1,0 +1,117 @@
+"""Functions of tensors and samples as compiled programs: traced by `torch.export`, compiled by `torch.compile`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils import _pytree
+
+from rts import InputError, RtsError
+from rts.plugin_api.arrays import Tree
+
+
+class Programs:
+    """A function of trees that traces and compiles another one for each kind of arguments, and keeps the programs.
+
+    Args:
+        f: the function.
+        vary: arguments → a tree like them, with True for each array whose first axis may have another length.
+        options: of `torch.compile`.
+        constant: (an array of NumPy, a tensor) → the array as a tensor beside it.
+    """
+
+    def __init__(self, f: Callable, vary: Callable[[Tree], Tree], options: Mapping[str, Any], constant: Callable):
+        if not hasattr(torch.export.Dim, "AUTO"):
+            raise InputError(f"rts.compiled needs torch 2.6 or later, and this is {torch.__version__}: call f itself")
+        self._f, self._vary, self._options, self._constant = f, vary, options, constant
+        self._programs: list[_Program] = []
+
+    def __call__(self, *args: Tree) -> Tree:
+        found, structure = _pytree.tree_flatten(args)
+        like = next(x for x in found if isinstance(x, Tensor))
+        found = [self._constant(x, like) if isinstance(x, np.ndarray) else x for x in found]
+        tensors = [x for x in found if isinstance(x, Tensor)]
+        others = [_TENSOR if isinstance(x, Tensor) else x for x in found]
+        kind = structure, others, [(x.dtype, x.device, x.requires_grad) for x in tensors], torch.is_grad_enabled()
+        for program in self._programs:
+            if program.kind == kind and program.takes(tensors):
+                return program.call(tensors)
+        varies = structure.flatten_up_to(self._vary(args))
+        free = [bool(v) for v, x in zip(varies, others, strict=True) if x is _TENSOR]
+        self._programs.append(self._traced(kind, tensors, free))
+        return self._programs[-1].call(tensors)
+
+    def _traced(self, kind: tuple, tensors: list[Tensor], free: Sequence[bool]) -> _Program:
+        """The program for arguments of a kind. The first axis of those that are `free` may have another length."""
+        structure, others, *_ = kind
+
+        def called(given: Sequence[Tensor]) -> Tree:
+            rest = iter(given)
+            return self._f(*_pytree.tree_unflatten([next(rest) if x is _TENSOR else x for x in others], structure))
+
+        lengths = [{0: torch.export.Dim.AUTO} if v else {} for v in free]
+        try:
+            traced = torch.export.export(_Module(called), (tensors,), dynamic_shapes=(lengths,), strict=False)
+        except RtsError:
+            raise
+        except Exception as error:  # torch has many kinds.
+            what = " ".join(str(error).split())[:120]
+            raise InputError(
+                f"torch cannot trace the function of rts.compiled ({type(error).__name__}: {what}); expected one that "
+                f"asks for no value of its arguments: call rts.sample before it, and pass the result"
+            ) from error
+        for x in (*traced.state_dict.values(), *traced.constants.values()):
+            if isinstance(x, Tensor) and x.requires_grad:
+                raise InputError(
+                    f"the function of rts.compiled closes over a tensor of shape {tuple(x.shape)} that requires a "
+                    f"gradient; expected it among the arguments, which have derivatives"
+                )
+        inputs = [node for node in traced.graph.nodes if node.name in traced.graph_signature.user_inputs]
+        shapes = [tuple(n if type(n) is int else str(n) for n in node.meta["val"].shape) for node in inputs]
+        return _Program(kind, shapes, torch.compile(traced.module(), dynamic=True, **self._options))
+
+
+_TENSOR = object()
+"""Stands for a tensor among leaves."""
+
+
+class _Module(torch.nn.Module):
+    """A function of tensors as a module, which `torch.export` takes."""
+
+    def __init__(self, f: Callable[[Sequence[Tensor]], Tree]):
+        super().__init__()
+        self._f = f
+
+    def forward(self, tensors: Sequence[Tensor]) -> Tree:
+        return self._f(tensors)
+
+
+class _Program(NamedTuple):
+    """A compiled function of tensors.
+
+    Attributes:
+        kind: what else has to be the same: structure of the arguments, other leaves, dtypes, devices, gradients.
+        shapes: the shape of each tensor; lengths that may change have names.
+        call: tensors → a tree.
+    """
+
+    kind: tuple
+    shapes: Sequence[tuple[int | str, ...]]
+    call: Callable[[Sequence[Tensor]], Tree]
+
+    def takes(self, tensors: Sequence[Tensor]) -> bool:
+        """True if tensors have these shapes. Lengths of one name are the same, and at least two, as torch has it."""
+        named: dict[str, int] = {}
+        for shape, x in zip(self.shapes, tensors, strict=True):
+            if len(shape) != x.ndim:
+                return False
+            for length, here in zip(shape, x.shape, strict=True):
+                if isinstance(length, str):
+                    length = named.setdefault(length, here) if here > 1 else -1
+                if length != here:
+                    return False
+        return True
