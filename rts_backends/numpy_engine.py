@@ -54,10 +54,6 @@ class NumpyEngine(Engine):
         """True: NumPy arrays are always on the host."""
         return True
 
-    def exact_products(self, *arrays: np.ndarray) -> bool:
-        """True: NumPy's products keep their precision."""
-        return True
-
     def concurrent(self) -> bool:
         """True: NumPy keeps no state for a thread, so several may compute at once."""
         return True

@@ -237,9 +237,7 @@ def _morphed(rows: Array, displacements: Array | None, weights: Array | None) ->
         return rows
     xp, engine = namespace(rows), engine_of(rows, displacements, weights)
     flat = xp.reshape(displacements, (displacements.shape[0], -1))
-    if engine.exact_products(weights, flat):
-        return rows + xp.reshape(weights @ flat, rows.shape)
-    return rows + xp.reshape(xp.sum(weights[:, None] * flat, axis=0), rows.shape)
+    return rows + xp.reshape(engine.product(weights[None, :], flat), rows.shape)
 
 
 def _turned(maps: Array, normals: Array) -> Array:

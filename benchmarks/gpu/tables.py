@@ -3,17 +3,21 @@
 Iterations are those of `benchmarks.speed.pose_iteration`: the silhouette or the shaded image of a mesh, the mean
 squared difference, its gradient, and a step of Adam. The paper's Table 1 has the same on a V100: rasterize-then-splat
 16, 16, 18 and 26 ms at 2.5K to 1.6M faces with gradients of vertices, 16, 16, 16 and 17 with those of the pose alone.
+
+Programs are compiled first, each in a process of its own, at once. Then one row after the other is timed.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import statistics
+import subprocess
 import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,15 +42,18 @@ class Setting(NamedTuple):
 
 
 NAMES = ("teapot_2464", "bunny", "spot", "nefertiti")
+COMPILED = "torch, compiled", "jax, compiled", "jax, in one program"
+"""`rts.compiled` of all but sampling, and all of an iteration under `jax.jit`."""
+
 SETTINGS = [
+    *(Setting("bunny", side, engine=engine) for side in (512, 256) for engine in COMPILED),
+    *(Setting(mesh, 512, engine=engine) for mesh in ("spot", "nefertiti") for engine in COMPILED[:2]),
+    *(Setting("bunny", 512, "full", engine=engine) for engine in COMPILED[:2]),
     *(Setting(mesh, side) for side in (512, 256) for mesh in NAMES),
-    *(Setting(mesh, 512, sampler="opengl") for mesh in NAMES[1:]),
     *(Setting(mesh, 512, "full") for mesh in NAMES),
-    *(Setting("bunny", side, engine="jax") for side in (512, 256)),
-    *(Setting("bunny", side, engine="jax, samples given") for side in (512, 256)),
-    Setting("bunny", 512, "full", engine="jax, samples given"),
+    *(Setting(mesh, 512, sampler="opengl") for mesh in NAMES[1:]),
 ]
-ON_CPU = SETTINGS[:8]
+ON_CPU = [Setting(mesh, 512) for mesh in NAMES]
 """Those that are timed on the CPU, too."""
 
 
@@ -83,71 +90,103 @@ def torch_step(task: Task, mode: str, device: str, sampler: str = "raster") -> d
     return {"sample": sample, "forward": forward, "backward": backward, "step": optimizer.step}
 
 
-def jax_step(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
-    """An iteration with jax, one compiled program."""
+def compiled_torch_step(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
+    """The stages of an iteration with torch: samples, and a compiled program of all others but the step."""
+    import torch
+
+    pose = torch.tensor(START).to(device).requires_grad_()
+    vertices = torch.tensor(task.vertices).to(device).requires_grad_(mode == "full")
+    target = torch.from_numpy(task.target).to(device)
+    optimizer = torch.optim.Adam([{"params": [pose], "lr": RATE}])
+    loss = rts.compiled(_loss_of(task))
+    kept: dict[str, Any] = {}
+
+    def sample() -> None:
+        pose.grad = vertices.grad = None
+        kept["sampled"] = _sampled(task, pose.detach(), vertices.detach(), sampler)
+
+    def others() -> None:
+        loss(pose, vertices, kept["sampled"], target).backward()
+
+    return {"sample": sample, "forward, backward": others, "step": optimizer.step}
+
+
+def compiled_jax_step(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
+    """The stages of an iteration with jax: samples, and a compiled program of all others."""
     import jax
 
-    variables, others, target = _on_jax(task, mode, device)
+    variables, target = _on_jax(task, device)
+    loss, kept, count = _loss_of(task), {}, 1 if mode == "pose" else 2
 
-    def loss(variables: dict) -> Any:
-        known = others | variables
-        return task.loss(known["pose"], known["vertices"], target, sampler)
+    def descended(pose: Any, vertices: Any, sampled: Any, target: Any) -> tuple:
+        value, gradient = jax.value_and_grad(loss, tuple(range(count)))(pose, vertices, sampled, target)
+        return pose - RATE * gradient[0], value, gradient
 
-    step = jax.jit(_step_of(loss))
+    step = rts.compiled(descended)
+
+    def sample() -> None:
+        kept["sampled"] = _sampled(task, variables[0], variables[1], sampler)
+
+    def others() -> None:
+        variables[0], *rest = step(*variables, kept["sampled"], target)
+        jax.block_until_ready(rest)
+
+    return {"sample": sample, "forward, backward, step": others}
+
+
+def one_program_step(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
+    """An iteration with jax, one compiled program that calls the host for samples."""
+    import jax
+
+    variables, target = _on_jax(task, device)
+    count = 1 if mode == "pose" else 2
+
+    def loss(pose: Any, vertices: Any, target: Any) -> Any:
+        return task.loss(pose, vertices, target, sampler)
+
+    @jax.jit
+    def step(pose: Any, vertices: Any, target: Any) -> tuple:
+        value, gradient = jax.value_and_grad(loss, tuple(range(count)))(pose, vertices, target)
+        return pose - RATE * gradient[0], value, gradient
 
     def iteration() -> None:
-        variables["pose"], *rest = step(variables)
+        variables[0], *rest = step(*variables, target)
         jax.block_until_ready(rest)
 
     return {"iteration": iteration}
 
 
-def jax_stages(task: Task, mode: str, device: str, sampler: str = "raster") -> dict[str, Callable[[], Any]]:
-    """The stages of an iteration with jax: samples, found outside of programs, and a compiled program of all others."""
-    import jax
+STEPS: dict[str, Callable[..., dict[str, Callable[[], Any]]]] = {
+    "torch": torch_step,
+    "torch, compiled": compiled_torch_step,
+    "jax, compiled": compiled_jax_step,
+    "jax, in one program": one_program_step,
+}
 
-    variables, others, target = _on_jax(task, mode, device)
-    kept: dict[str, Any] = {}
 
-    def part(known: dict) -> rts.Part:
-        return task.part.replace(theta={"vertices": known["vertices"]}, transform=rts.rigid(known["pose"]))
+def _loss_of(task: Task) -> Callable[..., Any]:
+    """The loss of samples: (pose, vertices, samples, target) → ()."""
 
-    def sample() -> None:
-        options: dict[str, Any] = {"sampler": sampler, "splatter": task.splatter, "layers": task.layers}
-        kept["sampled"] = rts.sample(part(others | variables), task.view, task.size, **options)
-
-    def loss(variables: dict, sampled: Any) -> Any:
-        image = rts.render_samples(sampled, part(others | variables), task.view, splatter=task.splatter)
+    def loss(pose: Any, vertices: Any, sampled: Any, target: Any) -> Any:
+        image = rts.render_samples(sampled, task.posed(pose, vertices), task.view, splatter=task.splatter)
         return task.reduction(image[..., task.channels] - target)
 
-    step = jax.jit(_step_of(loss))
-
-    def others_stages() -> None:
-        variables["pose"], *rest = step(variables, kept["sampled"])
-        jax.block_until_ready(rest)
-
-    return {"sample": sample, "shade, splat, backward, step": others_stages}
+    return loss
 
 
-def _on_jax(task: Task, mode: str, device: str) -> tuple[dict, dict, Any]:
-    """Variables of a task, all that a variable might be, and the target; arrays of jax on a device."""
+def _sampled(task: Task, pose: Any, vertices: Any, sampler: str) -> Any:
+    """The samples of a task's part."""
+    options: dict[str, Any] = {"sampler": sampler, "splatter": task.splatter, "layers": task.layers}
+    return rts.sample(task.posed(pose, vertices), task.view, task.size, **options)
+
+
+def _on_jax(task: Task, device: str) -> tuple[list, Any]:
+    """Pose and vertices of a task, and the target; arrays of jax on a device."""
     import jax
 
     where = jax.devices(device)[0]
     pose = jax.device_put(np.asarray(START, np.float32), where)
-    known = {"pose": pose, "vertices": jax.device_put(task.vertices, where)}
-    return dict(known) if mode == "full" else {"pose": pose}, known, jax.device_put(task.target, where)
-
-
-def _step_of(loss: Callable) -> Callable:
-    """A step down the gradient in the pose: (variables, ·) → pose, loss, gradient."""
-    import jax
-
-    def step(variables: dict, *others: Any) -> tuple:
-        value, gradient = jax.value_and_grad(loss)(variables, *others)
-        return variables["pose"] - RATE * gradient["pose"], value, gradient
-
-    return step
+    return [pose, jax.device_put(task.vertices, where)], jax.device_put(task.target, where)
 
 
 def timed(stages: dict[str, Callable[[], Any]], wait: Callable[[], None]) -> dict[str, float]:
@@ -202,38 +241,90 @@ def counted(stages: dict[str, Callable[[], Any]], device: str) -> dict[str, Any]
     }
 
 
-def row(setting: Setting, device: str, folder: Path) -> dict[str, Any]:
-    """A row of the table: the setting, its times, and counts."""
+def row(setting: Setting, device: str, folder: Path, turn: Callable[[], Any] = lambda: None) -> dict[str, Any]:
+    """A row of the table: the setting, its times, and counts; `turn` is called before any time is taken."""
     vertices, faces = kept_mesh(setting.mesh, folder)
     task = Task(setting.mesh, vertices, faces, setting.side, "lambert", 1)
     found: dict[str, Any] = {**setting._asdict(), "device": device, "faces": len(faces)}
-    if setting.engine != "torch":
-        stages = (jax_step if setting.engine == "jax" else jax_stages)(task, setting.mode, device, setting.sampler)
+    stages, start = STEPS[setting.engine](task, setting.mode, device, setting.sampler), time.perf_counter()
+    for stage in stages.values():
+        stage()
+    found["first, s"] = round(time.perf_counter() - start, 1)
+    turn()
+    if setting.engine.startswith("jax"):
         return found | {"ms": timed(stages, lambda: None)}
     import torch
 
-    stages = torch_step(task, setting.mode, device, setting.sampler)
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
     return found | {"ms": timed(stages, wait), **counted(stages, device)}
+
+
+def compiled_rows(settings: list[Setting], device: str, folder: Path, until: float) -> Iterator[dict[str, Any]]:
+    """The rows of settings that compile: each by a process of its own, all compiled before the first is timed."""
+    variables = {**os.environ, "TORCHINDUCTOR_COMPILE_THREADS": "4", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    processes = []
+    for setting in settings:
+        command = [sys.executable, "-m", "benchmarks.gpu.tables", "row", json.dumps(setting), device, str(folder)]
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": variables}
+        processes.append(subprocess.Popen(command, **pipes))
+    ended = time.monotonic() + (until - time.monotonic()) / 2
+    while time.monotonic() < ended and any(
+        p.poll() is None and not Path(_flag(folder, p.pid)).exists() for p in processes
+    ):
+        time.sleep(0.5)
+    for setting, process in zip(settings, processes, strict=True):
+        there = Path(_flag(folder, process.pid)).exists()
+        if not there:
+            process.kill()
+        printed, _ = process.communicate("go\n" if there else None)
+        Path(_flag(folder, process.pid)).unlink(missing_ok=True)
+        lines = [line for line in printed.splitlines() if line.startswith("{")]
+        yield (
+            json.loads(lines[-1]) if lines else {**setting._asdict(), "device": device, "error": "not compiled in time"}
+        )
+
+
+def _flag(folder: Path, pid: int) -> str:
+    """The file by which a process says that it has compiled."""
+    return f"{folder}/compiled.{pid}"
+
+
+def one_row(setting: str, device: str, folder: str) -> None:
+    """Compile, say so, wait for a line from standard input, and print the row."""
+
+    def turn() -> None:
+        Path(_flag(Path(folder), os.getpid())).touch()
+        sys.stdin.readline()
+
+    print(json.dumps(row(Setting(*json.loads(setting)), device, Path(folder), turn)), flush=True)
+
+
+def rows_of(settings: list[Setting], device: str, folder: Path, until: float) -> Iterator[dict[str, Any]]:
+    """The rows of settings, until the time is over."""
+    yield from compiled_rows([s for s in settings if s.engine != "torch"], device, folder, until)
+    for setting in (s for s in settings if s.engine == "torch"):
+        if time.monotonic() > until:
+            print(f"no time: {device} {setting}")
+            continue
+        try:
+            yield row(setting, device, folder)
+        except Exception as error:  # One that fails must not cost the others.
+            traceback.print_exc()
+            yield {**setting._asdict(), "device": device, "error": f"{type(error).__name__}: {error}"[:500]}
 
 
 def main(path: str, device: str, seconds: str) -> None:
     """Time all settings, on the device and on the CPU, until the seconds are over; write after each row."""
     until, out = time.monotonic() + float(seconds), Path(path)
-    rows: list[dict[str, Any]] = []
+    folder, rows = out.parent / "meshes", []
+    for mesh in NAMES:
+        kept_mesh(mesh, folder)
     for where in dict.fromkeys((device, "cpu")):
-        for setting in SETTINGS if where == device else ON_CPU:
-            if time.monotonic() > until:
-                print(f"no time: {where} {setting}")
-                continue
-            try:
-                rows.append(row(setting, where, out.parent / "meshes"))
-            except Exception as error:  # One that fails must not cost the others.
-                traceback.print_exc()
-                rows.append({**setting._asdict(), "device": where, "error": f"{type(error).__name__}: {error}"[:500]})
+        for found in rows_of(SETTINGS if where == device else ON_CPU, where, folder, until):
+            rows.append(found)
             print(rows[-1], flush=True)
             out.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4])
+    one_row(*sys.argv[2:5]) if sys.argv[1] == "row" else main(*sys.argv[1:4])

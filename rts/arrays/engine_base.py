@@ -82,13 +82,13 @@ class Engine(Plugin):
         """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
         raise self._no_derivatives()
 
-    def compiled(self, f: Callable[..., Tree], vary: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+    def compiled(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
         """A function like `f` that runs as one compiled program, for `rts.compiled`. The default returns `f` itself.
 
         Args:
             f: trees → a tree.
-            vary: arguments → a tree like them, with True for each array whose first axis may have another length in a
-                later call.
+            varying: arguments → a tree like them, with the axis of each array that may have another length in a later
+                call; −1 for none.
             options: of the compiler.
         """
         return f
@@ -178,9 +178,12 @@ class Engine(Plugin):
         """
         return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
 
-    def exact_products(self, *arrays: Array) -> bool:
-        """True if matrix products keep the arrays' precision. Matrix units of some devices round float32."""
-        return False
+    def product(self, a: Array, b: Array) -> Array:
+        """The product (…, N, M) of matrices (…, N, K) and (…, K, M), in the arrays' own precision.
+
+        Matrix units of some devices round float32 to fewer bits, unless an engine is told not to.
+        """
+        return a @ b
 
     def plain(self, x: Array) -> bool:
         """True if `admitted` is known to return the array itself, and is not called then."""

@@ -1,7 +1,4 @@
-"""Affine maps of points, and products of small matrices, in full precision.
-
-Matrix units of some devices round float32 products to fewer bits. There, products are computed elementwise.
-"""
+"""Affine maps of points, and products of small matrices, in full precision."""
 
 from __future__ import annotations
 
@@ -22,9 +19,7 @@ def matmul(a: Array, b: Array) -> Array:
     engine = engine_of(a, b)
     if type(a) is not type(b):
         a, b = constants((a, b), engine, exemplar(a, b))
-    if engine.exact_products(a, b):
-        return a @ b
-    return engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
+    return engine.product(a, b)
 
 
 def affine(row: Array, points: Array) -> Array:
@@ -39,10 +34,7 @@ def affine_map(rows: Array, points: Array) -> Array:
 
 def specified_affine_map(rows: Array, points: Array) -> Array:
     """`affine_map` in array code, its specification."""
-    engine = engine_of(rows, points)
-    if engine.exact_products(rows, points):
-        return points @ rows[:, :3].T + rows[:, 3]
-    return points[:, :1] * rows[:, 0] + points[:, 1:2] * rows[:, 1] + points[:, 2:] * rows[:, 2] + rows[:, 3]
+    return engine_of(rows, points).product(points, rows[:, :3].T) + rows[:, 3]
 
 
 def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:

@@ -45,23 +45,30 @@ def compiled(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
     def call(*args: Tree) -> Tree:
         engine = context_of(args).engine
         if engine.name not in programs:
-            programs[engine.name] = engine.compiled(f, _vary, options)
+            programs[engine.name] = engine.compiled(f, _varying, options)
         return programs[engine.name](*args)
 
     return call
 
 
-def _vary(tree: Tree) -> Tree:
-    """A tree with, for each array, whether the length of its first axis may vary: the number of samples, or of breaks.
+def _varying(tree: Tree) -> Tree:
+    """A tree with, for each array, the axis whose length may vary: the number of samples, or of breaks. −1 for none.
 
-    That of the result of `rts.sample` does, but for arrays (·, H, W) of its cells.
+    Arrays of the result of `rts.sample` have one, but for those (·, H, W) of its cells.
     """
     if isinstance(tree, Sampled):
         cells = tree.row.shape[-2:]
-        return map_leaves(lambda x: len(shape_of(x)) > 0 and shape_of(x)[-2:] != cells, tree)
+        return map_leaves(lambda x: _axis_of_samples(shape_of(x), cells), tree)
     if isinstance(tree, (list, tuple)):
-        items = [_vary(x) for x in tree]
+        items = [_varying(x) for x in tree]
         return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
     if isinstance(tree, Mapping):
-        return {name: _vary(x) for name, x in tree.items()}
-    return map_leaves(lambda _: False, tree)
+        return {name: _varying(x) for name, x in tree.items()}
+    return map_leaves(lambda _: -1, tree)
+
+
+def _axis_of_samples(shape: tuple[int, ...], cells: tuple[int, ...]) -> int:
+    if not shape or shape[-2:] == cells:
+        return -1
+    # Of several parts each has the cells that it is seen in, (·, 1, M).
+    return len(shape) - 1 if len(shape) > 2 and shape[-2] == 1 else 0

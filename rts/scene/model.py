@@ -163,7 +163,7 @@ class Model:
         for nodes, parents in self._levels:
             level = xp.take(local, engine.constant(nodes, local), axis=0)
             if done:
-                level = _products(xp.take(done[-1], engine.constant(parents, local), axis=0), level)
+                level = engine.product(xp.take(done[-1], engine.constant(parents, local), axis=0), level)
             done.append(level)
             order.append(nodes)
         if not done:
@@ -212,7 +212,9 @@ class Model:
         """The maps (J, 4, 4) of a skin's joints from the mesh at rest into the world."""
         engine, (_, joints, inverse) = engine_of(places), self.skins[skin]
         xp = engine.namespace
-        maps = _products(xp.take(places, engine.constant(joints, places), axis=0), engine.constant(inverse, places))
+        maps = engine.product(
+            xp.take(places, engine.constant(joints, places), axis=0), engine.constant(inverse, places)
+        )
         return maps.astype(np.float32) if engine.name == "numpy" else maps
 
     @cached_property
@@ -228,11 +230,3 @@ class Model:
             levels.append((nodes, places))
             above = nodes.tolist()
         return levels
-
-
-def _products(a: Array, b: Array) -> Array:
-    """Products (N, 4, 4) of matrices, in full precision."""
-    engine = engine_of(a, b)
-    if engine.exact_products(a, b):
-        return a @ b
-    return engine.namespace.sum(a[:, :, :, None] * b[:, None, :, :], axis=2)

@@ -48,14 +48,14 @@ def prefiltered(image: Array) -> dict[str, Array]:
     weights, waves, polynomials, blurs = (engine.constant(x, image) for x in _tables())
     sh = xp.sum(weights[:, :, None] * xp.reshape(middle, (1, -1, 3)), axis=1)
     # Each row in cosines and sines of the longitude, then each of these in Legendre functions of the latitude.
-    rows = xp.permute_dims(middle, (0, 2, 1)) @ waves / (2 * ROWS)
+    rows = engine.product(xp.permute_dims(middle, (0, 2, 1)), waves) / (2 * ROWS)
     rows = xp.permute_dims(xp.reshape(rows, (ROWS, 3, 2, ORDER + 1)), (3, 0, 1, 2))
     flat, fejer = xp.reshape(rows, (ORDER + 1, ROWS, 6)), engine.constant(_fejer()[:, None], image)
-    coefficients = xp.permute_dims(polynomials, (0, 2, 1)) @ (fejer * flat)
-    blurred = polynomials @ (blurs[:, None, :, None] * coefficients)
+    coefficients = engine.product(xp.permute_dims(polynomials, (0, 2, 1)), fejer * flat)
+    blurred = engine.product(polynomials, blurs[:, None, :, None] * coefficients)
     blurred = xp.permute_dims(xp.reshape(blurred, (-1, ORDER + 1, ROWS, 3, 2)), (0, 2, 3, 4, 1))
     twice = xp.concat([waves[:, :1], 2 * waves[:, 1 : ORDER + 1], 2 * waves[:, ORDER + 1 :]], axis=1)
-    levels = xp.reshape(blurred, (-1, ROWS, 3, 2 * ORDER + 2)) @ xp.permute_dims(twice, (1, 0))
+    levels = engine.product(xp.reshape(blurred, (-1, ROWS, 3, 2 * ORDER + 2)), xp.permute_dims(twice, (1, 0)))
     levels = xp.permute_dims(xp.where(levels > 0, levels, 0 * levels), (0, 1, 3, 2))
     return {"sh": sh, "image": image, "levels": xp.concat([middle[None], levels])}
 

@@ -52,7 +52,7 @@ def radiance(sh: Array, directions: Array, factors: Array) -> Array:
     xp = engine.namespace
     orders = engine.constant(np.repeat(np.arange(4), [1, 3, 5, 7])[:count], directions)
     sh, basis = sh[:count, ...], harmonics(directions, count) * xp.take(factors, orders, axis=-1)
-    total = basis @ sh if engine.exact_products(basis, sh) else xp.sum(basis[:, :, None] * sh[None], axis=1)
+    total = engine.product(basis, sh)
     return xp.where(total > 0, total, 0 * total)
 
 

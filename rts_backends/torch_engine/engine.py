@@ -112,10 +112,10 @@ class TorchEngine(Engine):
         """The devices of the tensors. Single numbers on the CPU count for nothing: torch takes them beside any."""
         return {x.device for x in arrays if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu)}
 
-    def exact_products(self, *arrays: torch.Tensor) -> bool:
-        """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""
-        a, b = arrays
-        return a.is_cpu and b.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
+    def product(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        """See `Engine.product`: by elements on devices, whose matrix units may be set to round, and in `autocast`."""
+        exact = a.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
+        return a @ b if exact else (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
 
     def plain(self, x: torch.Tensor) -> bool:
         """True for a dense tensor with values, of a dtype in `_REAL`, while torch's forward mode is off."""
@@ -208,11 +208,11 @@ class TorchEngine(Engine):
         """See `Engine.split`: by `torch.split`, whose derivative is one array for all pieces."""
         return torch.split(x, list(sizes))
 
-    def compiled(self, f: Callable[..., Tree], vary: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+    def compiled(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
         """See `Engine.compiled`: traced by `torch.export`, compiled by `torch.compile`."""
         from rts_backends.torch_engine.programs import Programs
 
-        return Programs(f, vary, options, self.constant)
+        return Programs(f, varying, options, self.constant)
 
     def value_and_grad(self, f: Callable) -> Callable:
         """See `Engine.value_and_grad`: by autograd on detached leaves; entries that `f` does not use get gradient 0."""

@@ -19,18 +19,19 @@ class Programs:
 
     Args:
         f: the function.
-        vary: arguments → a tree like them, with True for each array whose first axis may have another length.
+        varying: arguments → a tree like them, with the axis of each array that may have another length, −1 for none.
         options: of `torch.compile`.
         constant: (an array of NumPy, a tensor) → the array as a tensor beside it.
     """
 
-    def __init__(self, f: Callable, vary: Callable[[Tree], Tree], options: Mapping[str, Any], constant: Callable):
+    def __init__(self, f: Callable, varying: Callable[[Tree], Tree], options: Mapping[str, Any], constant: Callable):
         if not hasattr(torch.export.Dim, "AUTO"):
             raise InputError(f"rts.compiled needs torch 2.6 or later, and this is {torch.__version__}: call f itself")
-        self._f, self._vary, self._options, self._constant = f, vary, options, constant
+        self._f, self._varying, self._options, self._constant = f, varying, options, constant
         self._programs: list[_Program] = []
 
     def __call__(self, *args: Tree) -> Tree:
+        """What the function returns, by its program for such arguments."""
         found, structure = _pytree.tree_flatten(args)
         like = next(x for x in found if isinstance(x, Tensor))
         found = [self._constant(x, like) if isinstance(x, np.ndarray) else x for x in found]
@@ -40,20 +41,20 @@ class Programs:
         for program in self._programs:
             if program.kind == kind and program.takes(tensors):
                 return program.call(tensors)
-        varies = structure.flatten_up_to(self._vary(args))
-        free = [bool(v) for v, x in zip(varies, others, strict=True) if x is _TENSOR]
+        axes = structure.flatten_up_to(self._varying(args))
+        free = [axis for axis, x in zip(axes, others, strict=True) if x is _TENSOR]
         self._programs.append(self._traced(kind, tensors, free))
         return self._programs[-1].call(tensors)
 
-    def _traced(self, kind: tuple, tensors: list[Tensor], free: Sequence[bool]) -> _Program:
-        """The program for arguments of a kind. The first axis of those that are `free` may have another length."""
+    def _traced(self, kind: tuple, tensors: list[Tensor], free: Sequence[int]) -> _Program:
+        """The program for arguments of a kind. The axis `free` of each may have another length, if it is not −1."""
         structure, others, *_ = kind
 
         def called(given: Sequence[Tensor]) -> Tree:
             rest = iter(given)
             return self._f(*_pytree.tree_unflatten([next(rest) if x is _TENSOR else x for x in others], structure))
 
-        lengths = [{0: torch.export.Dim.AUTO} if v else {} for v in free]
+        lengths = [{} if axis < 0 else {axis: torch.export.Dim.AUTO} for axis in free]
         try:
             traced = torch.export.export(_Module(called), (tensors,), dynamic_shapes=(lengths,), strict=False)
         except RtsError:

@@ -103,30 +103,16 @@ def _nearest(points: Array, centers: Array, radii: Array) -> Array:
     `centers` (n, 2) are x and z in the plane y = 0, `radii` is (n,).
     """
     engine = engine_of(points)
-    xp, count = engine.namespace, centers.shape[0]
-    if engine.exact_products(points, centers):
-        # |p − c|² = (−2 c, 1, |c|²) · (p, |p|², 1), in blocks that stay in the cache.
-        of_points, of_centers = (xp.sum(x * x, axis=1, keepdims=True) for x in (points, centers))
-        rows = xp.concat([points[:, :1], points[:, 2:], of_points, xp.ones_like(of_points)], axis=1)
-        columns = xp.concat([-2 * centers, xp.ones_like(of_centers), of_centers], axis=1).T
+    xp = engine.namespace
+    # |p − c|² = (−2 c, 1, |c|²) · (p, |p|², 1), in blocks that stay in the cache.
+    of_points, of_centers = (xp.sum(x * x, axis=1, keepdims=True) for x in (points, centers))
+    rows = xp.concat([points[:, :1], points[:, 2:], of_points, xp.ones_like(of_points)], axis=1)
+    columns = xp.concat([-2 * centers, xp.ones_like(of_centers), of_centers], axis=1).T
 
-        def nearest(rows: Array) -> Array:
-            return xp.argmin(xp.sqrt(xp.clip(rows @ columns, 0, None)) - radii, axis=1)
+    def nearest(rows: Array) -> Array:
+        return xp.argmin(xp.sqrt(xp.clip(engine.product(rows, columns), 0, None)) - radii, axis=1)
 
-        return xp.astype(engine.map_rows(nearest, rows, BLOCK), xp.int32)
-
-    def body(state: dict[str, Array]) -> dict[str, Array]:
-        i = state["i"]
-        x, z = (xp.take(centers[:, j], i, axis=0) for j in range(2))
-        square = (points[:, 0] - x) ** 2 + points[:, 1] ** 2 + (points[:, 2] - z) ** 2
-        distance = xp.sqrt(square) - xp.take(radii, i, axis=0)
-        nearer = distance < state["least"]
-        least, index = xp.where(nearer, distance, state["least"]), xp.where(nearer, i, state["index"])
-        return {"i": i + 1, "least": least, "index": index}
-
-    index = xp.zeros_like(points[:, 0], dtype=xp.int32)
-    state = {"i": xp.zeros_like(radii[:1], dtype=xp.int32), "least": xp.full_like(points[:, 0], xp.inf), "index": index}
-    return engine.repeat(body, lambda state: state["i"][0] < count, state, count)["index"]
+    return xp.astype(engine.map_rows(nearest, rows, BLOCK), xp.int32)
 
 
 def _entry(theta: Mapping[str, Tree], name: str, shape: tuple[int | str, ...]) -> Array:

@@ -73,20 +73,14 @@ class BSpline(Patches):
         xp, engine = namespace(controls), engine_of(controls)
         a, b = (engine.constant(m, controls) for m in self._along)
         (nu, nv, width), (mu, mv) = controls.shape, (len(m) for m in self._along)
-        rows = xp.reshape(_product(a, xp.reshape(controls, (nu, nv * width))), (mu, nv, width))
+        rows = xp.reshape(engine.product(a, xp.reshape(controls, (nu, nv * width))), (mu, nv, width))
         rows = xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (nv, mu * width))
-        rows = xp.reshape(_product(b, rows), (mv, mu, width))
+        rows = xp.reshape(engine.product(b, rows), (mv, mu, width))
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """See `Patches`: exactly (nu, nv), the shape of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
-
-
-def _product(a: Array, b: Array) -> Array:
-    """The product of matrices a (n, m) and b (m, k) in full precision; matrix units of some devices have less."""
-    engine = engine_of(b)
-    return a @ b if engine.exact_products(a, b) else engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
 
 
 class Revolution(BSpline):

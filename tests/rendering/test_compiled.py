@@ -1,0 +1,158 @@
+"""`rts.compiled`: one program for each kind of arguments, with the values and derivatives of the function itself."""
+
+import numpy as np
+import pytest
+from helpers import icosphere, to_numpy
+
+import rts
+
+BALL, FACES = icosphere(2)
+CAMERA = rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=40)
+SIZE = (20, 20)
+COLORS = np.random.default_rng(0).uniform(0.2, 0.9, BALL.shape)
+POSES = np.array([[0.0] * 6, [0.1, 0.2, 0, 0.1, -0.1, 0.3], [0.3, 0, 0.1, 2.0, -0.1, 0.3], [0, 0, 0, 9, 0, 0]])
+"""The ball in the middle, nearer, across the border of the image, and outside."""
+CARD = np.array([[-0.7, -0.9, 0.6], [1.1, -1, 0.4], [1, 0.9, -0.3]])
+
+
+def engine_arrays(name, tree):
+    if name == "numpy":
+        return tree
+    to = pytest.importorskip(name).asarray if name == "torch" else pytest.importorskip("jax").numpy.asarray
+    return {k: to(np.float32(v)) for k, v in tree.items()}
+
+
+def scene(arrays, part):
+    ball = part.replace(theta={"vertices": arrays["vertices"], "colors": arrays["colors"]})
+    glass = np.array([0.3, 0.5, 0.8, 0.6], np.float32)
+    card = rts.Part(rts.Mesh([(0, 1, 2)]), {"vertices": np.float32(CARD), "color": glass}, "unlit")
+    return [ball.replace(transform=rts.rigid(arrays["pose"])), card]
+
+
+def image(arrays, part, sampled):
+    return rts.render_samples(sampled, scene(arrays, part), CAMERA)
+
+
+def loss(arrays, part, sampled):
+    return (image(arrays, part, sampled) ** 2).sum()
+
+
+def samples(arrays, part):
+    return rts.sample(scene(arrays, part), CAMERA, SIZE)
+
+
+def arrays_of(name, pose):
+    return engine_arrays(name, {"vertices": BALL, "colors": COLORS, "pose": pose})
+
+
+PART = rts.Part(rts.Mesh(FACES), {"vertices": BALL}, "lambert")
+
+
+def test_numpy_calls_the_function():
+    calls = []
+    f = rts.compiled(lambda x: calls.append(x) or 2 * x)
+    x = np.ones(3)
+    assert (f(x) == 2).all() and calls == [x] and f.__name__ == "<lambda>"
+
+
+def test_jax_compiles_the_function():
+    jax = pytest.importorskip("jax")
+    f = rts.compiled(lambda arrays, sampled: loss(arrays, PART, sampled))
+    for pose in POSES[:2]:
+        arrays = arrays_of("jax", pose)
+        sampled = samples(arrays, PART)
+        found, expected = (jax.value_and_grad(g)(arrays, sampled) for g in (f, lambda a, s: loss(a, PART, s)))
+        np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
+        for key, slope in expected[1].items():
+            np.testing.assert_allclose(found[1][key], slope, atol=1e-4 * float(abs(slope).max()))
+
+
+@pytest.mark.thorough
+def test_torch_makes_one_program_of_any_number_of_samples():
+    torch, programs = pytest.importorskip("torch"), []
+
+    def backend(graph, inputs):
+        programs.append(graph)
+        return graph
+
+    # A part and a camera among the arguments, and a tree for a result.
+    f = rts.compiled(lambda *args: {"loss": loss(*args), "image": image(*args)}, backend=backend)
+    for number, pose in enumerate(POSES[:3]):
+        arrays = {name: x.requires_grad_() for name, x in arrays_of("torch", pose).items()}
+        sampled = samples(arrays, PART)
+        made = f(arrays, PART, sampled)
+        np.testing.assert_allclose(to_numpy(made["image"]), to_numpy(image(arrays, PART, sampled)), atol=1e-5)
+        found = torch.autograd.grad(made["loss"], list(arrays.values()))
+        expected = torch.autograd.grad(loss(arrays, PART, sampled), list(arrays.values()))
+        for mine, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(mine, other, atol=1e-4 * float(other.abs().max()) + 1e-7)
+        assert len(programs) == 1, number
+
+
+def test_torch_makes_a_program_for_each_kind_of_arguments():
+    torch, programs = pytest.importorskip("torch"), []
+
+    def backend(graph, inputs):
+        programs.append(graph)
+        return graph
+
+    f = rts.compiled(lambda x, sampled, factor: factor * x * sampled.samples[0].params.sum(), backend=backend)
+    all_samples = [samples(arrays_of("torch", pose), PART) for pose in POSES]
+    x = torch.ones(3, requires_grad=True)
+
+    def checked(count, x, sampled, factor=2):
+        expected = factor * x.detach() * sampled.samples[0].params.sum()
+        found = f(x, sampled, factor)
+        assert torch.equal(found.detach(), expected) and found.requires_grad == (
+            x.requires_grad and torch.is_grad_enabled()
+        )
+        assert len(programs) == count
+
+    for sampled in all_samples[:3]:
+        checked(1, x, sampled)
+    checked(2, x, all_samples[3])  # No sample of the ball: torch takes one row for another kind of length.
+    checked(3, x, all_samples[0], factor=3)
+    checked(4, torch.ones(4, requires_grad=True), all_samples[0])
+    with torch.no_grad():
+        checked(5, x, all_samples[0])
+    checked(6, torch.ones(3), all_samples[0])
+    checked(7, torch.ones(3, dtype=torch.float64), all_samples[0])
+    assert f(np.ones(3), all_samples[0], 2).dtype == torch.float32 and len(programs) == 7  # As a tensor of float32.
+    for sampled in all_samples:
+        checked(7, x, sampled)
+
+
+@pytest.mark.thorough
+def test_torch_has_no_gradient_for_what_a_function_closes_over():
+    arrays = arrays_of("torch", POSES[1])
+    sampled, pose = samples(arrays, PART), arrays["pose"].clone().requires_grad_()
+    f = rts.compiled(lambda s: loss({**arrays, "pose": pose}, PART, s), backend="eager")
+    with pytest.raises(rts.InputError, match=r"closes over a tensor of shape \(6,\) that requires a gradient"):
+        f(sampled)
+
+
+def test_torch_refuses_a_function_that_samples():
+    arrays = arrays_of("torch", POSES[1])
+    f = rts.compiled(lambda a: rts.render(scene(a, PART), CAMERA, SIZE).sum(), backend="eager")
+    with pytest.raises(rts.InputError, match="cannot trace the function of rts.compiled .* call rts.sample before it"):
+        f(arrays)
+
+
+def test_torch_passes_the_library_s_own_errors_on():
+    arrays = arrays_of("torch", POSES[1])
+    f = rts.compiled(lambda a: rts.rigid(a["pose"][:5]), backend="eager")
+    with pytest.raises(rts.InputError, match="^pose .*expected"):
+        f(arrays)
+
+
+def test_an_old_torch_is_refused(monkeypatch):
+    torch = pytest.importorskip("torch")
+    if hasattr(torch.export.Dim, "AUTO"):
+        monkeypatch.delattr(torch.export.Dim, "AUTO")
+    with pytest.raises(rts.InputError, match=r"rts.compiled needs torch 2.6 or later, and this is .*: call f itself"):
+        rts.compiled(lambda x: x)(torch.ones(2))
+
+
+def test_what_is_no_function_is_refused():
+    with pytest.raises(rts.InputError, match="rts.compiled was given 3; expected a function"):
+        rts.compiled(3)
