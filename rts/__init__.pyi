@@ -57,8 +57,8 @@ from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.arguments import Adaptive as Adaptive
-from rts.rendering.compiled import compiled
 from rts.rendering.image import render, render_samples
+from rts.rendering.program import program
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -92,7 +92,6 @@ __all__ = [
     "View",
     "ViewResiduals",
     "check_gradient",
-    "compiled",
     "engine_of",
     "explain",
     "fit",
@@ -106,6 +105,7 @@ __all__ = [
     "plugins",
     "prepare",
     "profile",
+    "program",
     "pyramid",
     "render",
     "render_samples",

@@ -92,7 +92,7 @@ def names(crossings: list[Crossing]) -> list[str]:
     known: list[str] = []
     for crossing in crossings:
         call = crossing.way, crossing.line.rpartition(" ")[2]
-        if crossing.shape in ((), (1,), (3,), (4, 4)):
+        if crossing.shape in ((), (1,), (3,), (6,), (4, 4)):
             known.append(NUMBERS)
             continue
         known.append(ORDER[call][found[call]] if call in ORDER else OF_OPERATIONS.get(call, call[1]))

@@ -43,7 +43,7 @@ class Setting(NamedTuple):
 
 NAMES = ("teapot_2464", "bunny", "spot", "nefertiti")
 COMPILED = "torch, compiled", "jax, compiled", "jax, in one program"
-"""`rts.compiled` of all but sampling, and all of an iteration under `jax.jit`."""
+"""`rts.program` of all but sampling, and all of an iteration under `jax.jit`."""
 
 SETTINGS = [
     *(Setting("bunny", side, engine=engine) for side in (512, 256) for engine in COMPILED),
@@ -98,7 +98,7 @@ def compiled_torch_step(task: Task, mode: str, device: str, sampler: str = "rast
     vertices = torch.tensor(task.vertices).to(device).requires_grad_(mode == "full")
     target = torch.from_numpy(task.target).to(device)
     optimizer = torch.optim.Adam([{"params": [pose], "lr": RATE}])
-    loss = rts.compiled(_loss_of(task))
+    loss = rts.program(_loss_of(task))
     kept: dict[str, Any] = {}
 
     def sample() -> None:
@@ -122,7 +122,7 @@ def compiled_jax_step(task: Task, mode: str, device: str, sampler: str = "raster
         value, gradient = jax.value_and_grad(loss, tuple(range(count)))(pose, vertices, sampled, target)
         return pose - RATE * gradient[0], value, gradient
 
-    step = rts.compiled(descended)
+    step = rts.program(descended)
 
     def sample() -> None:
         kept["sampled"] = _sampled(task, variables[0], variables[1], sampler)

@@ -82,8 +82,8 @@ class Engine(Plugin):
         """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
         raise self._no_derivatives()
 
-    def compiled(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
-        """A function like `f` that runs as one compiled program, for `rts.compiled`. The default returns `f` itself.
+    def program(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """A function like `f` that runs as one compiled program, for `rts.program`. The default returns `f` itself.
 
         Args:
             f: trees → a tree.

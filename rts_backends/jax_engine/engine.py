@@ -166,8 +166,8 @@ class JaxEngine(Engine):
         """See `Engine.product`: with the precision "highest"."""
         return jnp.matmul(a, b, precision="highest")
 
-    def compiled(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
-        """See `Engine.compiled`: by `jax.jit`, which compiles anew for another number of samples."""
+    def program(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """See `Engine.program`: by `jax.jit`, which compiles anew for another number of samples."""
         return jax.jit(f, **options)
 
     def stop_gradient(self, x: jax.Array) -> jax.Array:

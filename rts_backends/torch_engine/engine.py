@@ -208,8 +208,8 @@ class TorchEngine(Engine):
         """See `Engine.split`: by `torch.split`, whose derivative is one array for all pieces."""
         return torch.split(x, list(sizes))
 
-    def compiled(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
-        """See `Engine.compiled`: traced by `torch.export`, compiled by `torch.compile`."""
+    def program(self, f: Callable[..., Tree], varying: Callable[[Tree], Tree], options: Mapping[str, Any]) -> Callable:
+        """See `Engine.program`: traced by `torch.export`, compiled by `torch.compile`."""
         from rts_backends.torch_engine.programs import Programs
 
         return Programs(f, varying, options, self.constant)

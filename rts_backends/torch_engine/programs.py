@@ -26,7 +26,7 @@ class Programs:
 
     def __init__(self, f: Callable, varying: Callable[[Tree], Tree], options: Mapping[str, Any], constant: Callable):
         if not hasattr(torch.export.Dim, "AUTO"):
-            raise InputError(f"rts.compiled needs torch 2.6 or later, and this is {torch.__version__}: call f itself")
+            raise InputError(f"rts.program needs torch 2.6 or later, and this is {torch.__version__}: call f itself")
         self._f, self._varying, self._options, self._constant = f, varying, options, constant
         self._programs: list[_Program] = []
 
@@ -62,13 +62,13 @@ class Programs:
         except Exception as error:  # torch has many kinds.
             what = " ".join(str(error).split())[:120]
             raise InputError(
-                f"torch cannot trace the function of rts.compiled ({type(error).__name__}: {what}); expected one that "
+                f"torch cannot trace the function of rts.program ({type(error).__name__}: {what}); expected one that "
                 f"asks for no value of its arguments: call rts.sample before it, and pass the result"
             ) from error
         for x in (*traced.state_dict.values(), *traced.constants.values()):
             if isinstance(x, Tensor) and x.requires_grad:
                 raise InputError(
-                    f"the function of rts.compiled closes over a tensor of shape {tuple(x.shape)} that requires a "
+                    f"the function of rts.program closes over a tensor of shape {tuple(x.shape)} that requires a "
                     f"gradient; expected it among the arguments, which have derivatives"
                 )
         inputs = [node for node in traced.graph.nodes if node.name in traced.graph_signature.user_inputs]

@@ -1,4 +1,4 @@
-"""`rts.compiled`: one program for each kind of arguments, with the values and derivatives of the function itself."""
+"""`rts.program`: one program for each kind of arguments, with the values and derivatives of the function itself."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from helpers import icosphere, to_numpy
 
 import rts
 
+pytestmark = pytest.mark.rendering
 BALL, FACES = icosphere(2)
 CAMERA = rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=40)
 SIZE = (20, 20)
@@ -50,14 +51,14 @@ PART = rts.Part(rts.Mesh(FACES), {"vertices": BALL}, "lambert")
 
 def test_numpy_calls_the_function():
     calls = []
-    f = rts.compiled(lambda x: calls.append(x) or 2 * x)
+    f = rts.program(lambda x: calls.append(x) or 2 * x)
     x = np.ones(3)
     assert (f(x) == 2).all() and calls == [x] and f.__name__ == "<lambda>"
 
 
 def test_jax_compiles_the_function():
     jax = pytest.importorskip("jax")
-    f = rts.compiled(lambda arrays, sampled: loss(arrays, PART, sampled))
+    f = rts.program(lambda arrays, sampled: loss(arrays, PART, sampled))
     for pose in POSES[:2]:
         arrays = arrays_of("jax", pose)
         sampled = samples(arrays, PART)
@@ -76,7 +77,7 @@ def test_torch_makes_one_program_of_any_number_of_samples():
         return graph
 
     # A part and a camera among the arguments, and a tree for a result.
-    f = rts.compiled(lambda *args: {"loss": loss(*args), "image": image(*args)}, backend=backend)
+    f = rts.program(lambda *args: {"loss": loss(*args), "image": image(*args)}, backend=backend)
     for number, pose in enumerate(POSES[:3]):
         arrays = {name: x.requires_grad_() for name, x in arrays_of("torch", pose).items()}
         sampled = samples(arrays, PART)
@@ -96,7 +97,7 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
         programs.append(graph)
         return graph
 
-    f = rts.compiled(lambda x, sampled, factor: factor * x * sampled.samples[0].params.sum(), backend=backend)
+    f = rts.program(lambda x, sampled, factor: factor * x * sampled.samples[0].params.sum(), backend=backend)
     all_samples = [samples(arrays_of("torch", pose), PART) for pose in POSES]
     x = torch.ones(3, requires_grad=True)
 
@@ -126,21 +127,21 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
 def test_torch_has_no_gradient_for_what_a_function_closes_over():
     arrays = arrays_of("torch", POSES[1])
     sampled, pose = samples(arrays, PART), arrays["pose"].clone().requires_grad_()
-    f = rts.compiled(lambda s: loss({**arrays, "pose": pose}, PART, s), backend="eager")
+    f = rts.program(lambda s: loss({**arrays, "pose": pose}, PART, s), backend="eager")
     with pytest.raises(rts.InputError, match=r"closes over a tensor of shape \(6,\) that requires a gradient"):
         f(sampled)
 
 
 def test_torch_refuses_a_function_that_samples():
     arrays = arrays_of("torch", POSES[1])
-    f = rts.compiled(lambda a: rts.render(scene(a, PART), CAMERA, SIZE).sum(), backend="eager")
-    with pytest.raises(rts.InputError, match="cannot trace the function of rts.compiled .* call rts.sample before it"):
+    f = rts.program(lambda a: rts.render(scene(a, PART), CAMERA, SIZE).sum(), backend="eager")
+    with pytest.raises(rts.InputError, match="cannot trace the function of rts.program .* call rts.sample before it"):
         f(arrays)
 
 
 def test_torch_passes_the_library_s_own_errors_on():
     arrays = arrays_of("torch", POSES[1])
-    f = rts.compiled(lambda a: rts.rigid(a["pose"][:5]), backend="eager")
+    f = rts.program(lambda a: rts.rigid(a["pose"][:5]), backend="eager")
     with pytest.raises(rts.InputError, match="^pose .*expected"):
         f(arrays)
 
@@ -149,10 +150,10 @@ def test_an_old_torch_is_refused(monkeypatch):
     torch = pytest.importorskip("torch")
     if hasattr(torch.export.Dim, "AUTO"):
         monkeypatch.delattr(torch.export.Dim, "AUTO")
-    with pytest.raises(rts.InputError, match=r"rts.compiled needs torch 2.6 or later, and this is .*: call f itself"):
-        rts.compiled(lambda x: x)(torch.ones(2))
+    with pytest.raises(rts.InputError, match=r"rts.program needs torch 2.6 or later, and this is .*: call f itself"):
+        rts.program(lambda x: x)(torch.ones(2))
 
 
 def test_what_is_no_function_is_refused():
-    with pytest.raises(rts.InputError, match="rts.compiled was given 3; expected a function"):
-        rts.compiled(3)
+    with pytest.raises(rts.InputError, match="rts.program was given 3; expected a function"):
+        rts.program(3)

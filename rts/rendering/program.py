@@ -1,4 +1,4 @@
-"""`rts.compiled`: shading and splatting as one program of torch or jax, for devices that wait for every operator."""
+"""`rts.program`: shading and splatting as one program of torch or jax, for devices that wait for every operator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rts.contracts.records import Sampled
 from rts.errors import InputError
 
 
-def compiled(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
+def program(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
     """A function like `f` that runs as one program, which the engine of its arguments compiles at the first call.
 
     For a GPU, where torch otherwise launches hundreds of small operators one by one. Call `rts.sample` before, and pass
@@ -38,14 +38,14 @@ def compiled(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
         EngineError: when called, with torch and jax arrays at once, or arrays on two devices.
     """
     if not callable(f):
-        raise InputError(f"rts.compiled was given {quoted(f)}; expected a function, such as loss(pose, sampled)")
+        raise InputError(f"rts.program was given {quoted(f)}; expected a function, such as loss(pose, sampled)")
     programs: dict[str, Callable[..., Tree]] = {}
 
     @functools.wraps(f)
     def call(*args: Tree) -> Tree:
         engine = context_of(args).engine
         if engine.name not in programs:
-            programs[engine.name] = engine.compiled(f, _varying, options)
+            programs[engine.name] = engine.program(f, _varying, options)
         return programs[engine.name](*args)
 
     return call
