@@ -9,6 +9,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
+from rts.operations.texels import texels
 from rts.shading.spherical_harmonics import harmonics
 from rts.shading.textures import mip_levels
 from rts.shading.theta_entries import check_entry, shape_of
@@ -17,6 +18,8 @@ ROWS = 128
 """Rows of each level; there are twice as many columns."""
 ORDER = 64
 """The highest order of spherical harmonics of blurred levels: those of roughness 0.2 and more have little beyond."""
+AROUND = "repeat", "clamp"
+"""How an equirectangular image goes on: its columns repeat."""
 STEPS = 16
 """Number of roughnesses above 0 in the table of `blurs`."""
 ROUGHNESS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0)
@@ -82,62 +85,28 @@ def reflected(environment: Mapping[str, Array], directions: Array, roughness: Ar
     finer = xp.clip(xp.floor(engine.stop_gradient(number)), 0.0, len(ROUGHNESS) - 2.0)
     images, share = [environment["image"], *(levels[i, ...] for i in range(levels.shape[0]))], number - finer
     index = xp.astype(xp.where(finer == finer, finer, 0.0)[:, 0], xp.int32)
-    u, v = _places(directions)
-    sizes = np.array([x.shape[:2] for x in images], np.float32)
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int32)
-    table = xp.concat([xp.reshape(x, (-1, 3)) for x in images])
-
-    def of_image(number: Array) -> Array:
-        size = xp.take(engine.constant(sizes, u), number, axis=0)
-        return _bilinear(table, u, v, size[:, 0], size[:, 1], xp.take(engine.constant(starts, u), number, axis=0))
-
-    first = of_image(index)
-    return first + share * (of_image(index + 1) - first)
+    sizes, table = [shape_of(x)[:2] for x in images], xp.concat([xp.reshape(x, (-1, 3)) for x in images])
+    # One lookup of both levels: engines make an array as large as the table for the gradient of each.
+    uv, number = (xp.concat(x) for x in ([_places(directions)] * 2, [index, index + 1]))
+    found = xp.reshape(texels(table, uv, sizes, number, AROUND), (2, -1, 3))
+    return found[0, ...] + share * (found[1, ...] - found[0, ...])
 
 
 def _looked_up(image: Array, directions: Array) -> Array:
     """Bilinear lookup (N, 3) of unit directions (N, 3) in an equirectangular image (h, w, 3)."""
-    (height, width), table = image.shape[:2], namespace(image).reshape(image, (-1, 3))
-    return _bilinear(table, *_places(directions), float(height), float(width), 0)
+    table = namespace(image).reshape(image, (-1, 3))
+    return texels(table, _places(directions), [shape_of(image)[:2]], None, AROUND)
 
 
-def _places(directions: Array) -> tuple[Array, Array]:
-    """Shares (N,) of the width and of the height of an equirectangular image at which directions (N, 3) are seen."""
+def _places(directions: Array) -> Array:
+    """Where in an equirectangular image directions (N, 3) are seen: u and v (N, 2), v from below."""
     xp = namespace(directions)
     x, y, z = (directions[:, i] for i in range(3))
     # At the poles all longitudes are one.
     pole = x * x + z * z < 1e-12
     x, z = xp.where(pole, 0 * x, x), xp.where(pole, 0 * z - 1e-6, z)
-    return 0.5 + xp.atan2(x, -z) / (2 * np.pi), xp.atan2(xp.sqrt(x * x + z * z), y) / np.pi
-
-
-def _bilinear(
-    table: Array, u: Array, v: Array, height: Array | float, width: Array | float, start: Array | int
-) -> Array:
-    """Bilinear lookup (N, 3) at shares (N,) of width and height in images whose texels are rows of a table (T, 3).
-
-    Args:
-        table: texels.
-        u: shares of the width; columns repeat.
-        v: shares of the height.
-        height: the image's rows, of each lookup (N,) or of all.
-        width: its columns.
-        start: the row of its first texel.
-    """
-    xp, stop = namespace(table, u), engine_of(u).stop_gradient
-    column, row = u * width - 0.5, v * height - 0.5
-    # What is no number names some texel, and stays none by its shares.
-    left, top = (xp.where(x == x, x, 0.0) for x in (xp.floor(stop(column)), xp.floor(stop(row))))
-    right, down = (column - left)[:, None], (row - top)[:, None]
-    # Compilers divide by way of reciprocals, whose rounding would lead out of the row.
-    columns = [xp.where(x < 0, x + width, xp.where(x >= width, x - width, x)) for x in (left, left + 1)]
-    rows = [xp.clip(xp.clip(x, 0.0, None), None, height - 1) for x in (top, top + 1)]
-
-    index = [xp.astype(y * width + x, xp.int32) + start for y in rows for x in columns]
-    texels = xp.reshape(xp.take(table, xp.concat(index), axis=0), (4, -1, 3))
-    upper = texels[0, ...] + right * (texels[1, ...] - texels[0, ...])
-    lower = texels[2, ...] + right * (texels[3, ...] - texels[2, ...])
-    return upper + down * (lower - upper)
+    down = xp.atan2(xp.sqrt(x * x + z * z), y) / np.pi
+    return xp.stack([0.5 + xp.atan2(x, -z) / (2 * np.pi), 1 - down], axis=1)
 
 
 @functools.cache

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
@@ -11,6 +9,7 @@ from rts.arrays.array_functions import described, shape_of
 from rts.arrays.engines import engine_of, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.errors import InputError
+from rts.operations.texels import texels
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Continuations of a texture outside [0, 1]."""
@@ -18,8 +17,6 @@ FILTERS = ("linear", "nearest")
 """Ways to read between the centres of texels."""
 TAPS = (4, 2, 1)
 """Numbers of lookups along the longer axis of a footprint."""
-CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""The four texels of a bilinear lookup: down and right."""
 Wrap = str | tuple[str, str]
 """A continuation, or one along u and one along v."""
 
@@ -67,13 +64,12 @@ def sample_texture(
             f"the texture has dtype {texture.dtype}; expected floating numbers, linear and from 0 to 1 (rts.load_image)"
         )
     height, width, channels = shape
+    wrap = (wrap, wrap) if isinstance(wrap, str) else wrap
     if footprint is None:
-        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width, filter=filter)
+        return texels(xp.reshape(texture, (height * width, channels)), uv, [(height, width)], None, wrap, filter)
     levels, engine = mip_levels(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
-    sizes = np.array([x.shape[:2] for x in levels])
-    first = engine.constant(np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1), uv)
-    heights, widths = (engine.constant(x.astype(np.float32), uv) for x in sizes.T)
+    sizes = [shape_of(x)[:2] for x in levels]
 
     def averaged(uv: Array, level: Array, step: Array, count: Array, most: int) -> Array:
         """The mean of each row's taps, of which there are at most `most`."""
@@ -82,9 +78,7 @@ def sample_texture(
         place = xp.concat([uv + (i - 0.5 * (count - 1))[:, None] * step for i in range(most)] * 2)
         finer, coarser = (xp.astype(x, xp.int32) for x in (finer, xp.clip(finer + 1, 0, len(levels) - 1)))
         number = xp.concat([finer] * most + [coarser] * most)
-        of_levels = (xp.take(x, number, axis=0) for x in (heights, widths, first))
-        tap = _bilinear(table, place, wrap, *of_levels, filter=filter)
-        tap = xp.reshape(tap, (2, most, -1, channels))
+        tap = xp.reshape(texels(table, place, sizes, number, wrap, filter), (2, most, -1, channels))
         tap = tap[0, ...] + (level - xp.astype(finer, level.dtype))[:, None] * (tap[1, ...] - tap[0, ...])
         if most == 1:
             return tap[0, ...]
@@ -173,45 +167,3 @@ def _halved(x: Array) -> Array:
     xp, m = namespace(x), n // 2
     part = xp.reshape(engine_of(x).constant(np.arange(m) / n, x), (m, 1, 1))
     return (m / n - part) * x[0:-1:2, ...] + m / n * x[1::2, ...] + (part + 1 / n) * x[2::2, ...]
-
-
-def _bilinear(
-    flat: Array, uv: Array, wrap: Wrap, height: Any, width: Any, first: Array | None = None, filter: str = "linear"
-) -> Array:
-    """Bilinear lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
-
-    Args:
-        flat: (M, C), the texels.
-        uv: (N, 2).
-        wrap: see `sample_texture`.
-        height: height of the texture; for several textures (N,) floats of uv's dtype.
-        width: width, in the same form.
-        first: (N,) integers, the table row of the texture's first texel; None for a single texture.
-        filter: see `sample_texture`.
-    """
-    xp = namespace(flat, uv)
-    columns = width if first is None else xp.astype(width, xp.int32)
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    if filter == "nearest":
-        x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
-    x0, y0 = xp.floor(x), xp.floor(y)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-
-    along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
-    index = [_wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u) for dy, dx in CORNERS]
-    index = index if first is None else [i + first for i in index]
-    texels = xp.reshape(xp.take(flat, xp.concat(index), axis=0), (4, -1, flat.shape[1]))
-    upper, lower = (texels[i, ...] + fx * (texels[i + 1, ...] - texels[i, ...]) for i in (0, 2))
-    return upper + fy * (lower - upper)
-
-
-def _wrapped(index: Array, count: Any, wrap: str) -> Array:
-    """Whole-numbered floats as int32 in [0, count), by `wrap` where they lie outside; 0 for NaN."""
-    xp = namespace(index)
-    index = xp.where(index - index == 0, index, 0.0)  # NaN and infinity have no texel; they would be out of range.
-    if wrap == "repeat":
-        index = index - xp.floor(index / count) * count
-    elif wrap == "mirror":
-        index = index - xp.floor(index / (2 * count)) * (2 * count)
-        index = xp.where(index >= count, 2 * count - 1 - index, index)
-    return xp.astype(xp.clip(xp.clip(index, 0.0, None), None, count - 1), xp.int32)

@@ -1,0 +1,118 @@
+"""Bilinear lookups in tables of texels, of one image or of several, one after the other."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.errors import InputError
+from rts.operations.operation import Operation
+
+CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""The four texels of a lookup: down and right."""
+
+
+def texels(
+    table: Array,
+    uv: Array,
+    sizes: Sequence[tuple[int, ...]],
+    image: Array | None = None,
+    wrap: tuple[str, str] = ("repeat", "repeat"),
+    filter: str = "linear",
+) -> Array:
+    """Bilinear lookups (N, C), differentiable in the table and in uv.
+
+    Args:
+        table: (M, C) float, the texels of all images, row by row, the uppermost first.
+        uv: (N, 2) float, u to the right and v up; (0, 0) is the lower left corner of an image.
+        sizes: (height, width) of each image, in their order in the table.
+        image: (N,) integers, which image each lookup is of, from 0 on; None for the first.
+        wrap: continuations outside [0, 1] along u and v: "repeat", "mirror" or "clamp".
+        filter: "nearest" takes the texel around a point, without derivative in uv; "linear" does not.
+    """
+    engine = engine_of(table, uv)
+    places, first = _places(tuple(sizes))
+    number = engine.constant(first, uv) if image is None else namespace(image).astype(image, namespace(image).int32)
+    return TEXELS(table, uv, number, engine.constant(places, uv), wrap=wrap, filter=filter)
+
+
+@functools.cache
+def _places(sizes: tuple[tuple[int, ...], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Height, width and first row in the table (L, 3) of images; and the number of the first (1,); read-only."""
+    counts = np.array([height * width for height, width in sizes])
+    first = np.cumsum(counts) - counts
+    places = np.stack([*np.array(sizes).T, first], axis=1).astype(np.int32)
+    number = np.zeros(1, np.int32)
+    places.flags.writeable = number.flags.writeable = False
+    return places, number
+
+
+def _specification(
+    table: Array, uv: Array, image: Array, places: Array, *, wrap: tuple[str, str], filter: str
+) -> Array:
+    xp = namespace(table, uv)
+    of_rows = xp.take(places, image, axis=0)
+    height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    if filter == "nearest":
+        x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
+    x0, y0 = xp.floor(x), xp.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    rows, columns = (
+        [_wrapped(a + i, n, w) for i in range(2)] for a, n, w in ((y0, height, wrap[1]), (x0, width, wrap[0]))
+    )
+    index = xp.concat([rows[dy] * of_rows[:, 1] + columns[dx] + of_rows[:, 2] for dy, dx in CORNERS])
+    found = xp.reshape(xp.take(table, index, axis=0), (4, -1, table.shape[1]))
+    upper, lower = (found[i, ...] + fx * (found[i + 1, ...] - found[i, ...]) for i in (0, 2))
+    return upper + fy * (lower - upper)
+
+
+def _wrapped(index: Array, count: Array, wrap: str) -> Array:
+    """Whole-numbered floats as int32 in [0, count), by `wrap` where they lie outside; 0 for NaN."""
+    xp = namespace(index)
+    index = xp.where(index - index == 0, index, 0.0)  # NaN and infinity have no texel; they would be out of range.
+    if wrap == "repeat":
+        index = index - xp.floor(index / count) * count
+        # Compilers divide by way of reciprocals, whose rounding would lead out of the row.
+        index = xp.where(index >= count, index - count, index)
+    elif wrap == "mirror":
+        index = index - xp.floor(index / (2 * count)) * (2 * count)
+        index = xp.where(index >= count, 2 * count - 1 - index, index)
+    return xp.astype(xp.clip(xp.clip(index, 0.0, None), None, count - 1), xp.int32)
+
+
+def _shape(table: tuple[int, ...], uv: tuple[int, ...], *_: tuple[int, ...], **__: Any) -> tuple[int, ...]:
+    return uv[0], table[1]
+
+
+def _check(table: np.ndarray, uv: np.ndarray, image: np.ndarray, places: np.ndarray, **_: Any) -> None:
+    if uv.shape[1] != 2 or places.shape[1] != 3 or not (len(image) == 1 or len(image) >= len(uv)):
+        shapes = ", ".join(str(x.shape) for x in (table, uv, image, places))
+        raise InputError(f"table, uv, image and places have shapes {shapes}; expected (M, C), (N, 2), (N,), (L, 3)")
+    if image.size and not 0 <= image.min() <= image.max() < len(places):
+        raise InputError(f"images from {image.min()} to {image.max()} were asked for, of {len(places)}")
+
+
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import texels_loops as loops
+
+    return loops.forward, loops.push, loops.pull
+
+
+TEXELS = Operation.of_loops(
+    "rts.texels",
+    _specification,
+    (2, 2, 1, 2),
+    _shape,
+    _loops,
+    _check,
+    differentiable=2,
+    packed=(1,),
+    packed_result=True,
+)
+"""The operation of `texels`, on table (M, C), uv (N, 2), numbers of images (N,) or (1,), and their places (L, 3)."""
