@@ -5,8 +5,6 @@ Operands are those of `rts.operations.texels.TEXELS`. Gradients of texels are ad
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
@@ -14,6 +12,8 @@ from rts.compiling.threads import parallel
 
 WRAPS = {"clamp": 0, "repeat": 1, "mirror": 2}
 """Numbers of continuations."""
+FAR = np.float32(2**30)
+"""Farther out any texel serves, and for NaN, whose shares are none."""
 
 
 def forward(
@@ -81,14 +81,16 @@ def _numbers(wrap, filter):
 
 @compiled
 def _wrapped(index, count, wrap):
-    """A whole-numbered float as an integer in [0, count); 0 for NaN and infinity, which have no texel."""
-    place = float(index) if math.isfinite(index) else 0.0
-    if wrap == 1:
-        place -= math.floor(place / count) * count
-    elif wrap == 2:
-        place -= math.floor(place / (2 * count)) * (2 * count)
-        place = 2 * count - 1 - place if place >= count else place
-    return int(min(max(place, 0.0), count - 1.0))
+    """An integer in [0, count) for any."""
+    if not 0 <= index < count:  # Most are inside, and divisions are slow.
+        if wrap == 1:
+            index %= count
+        elif wrap == 2:
+            index %= 2 * count
+            index = 2 * count - 1 - index if index >= count else index
+        else:
+            index = min(max(index, 0), count - 1)
+    return index
 
 
 @compiled
@@ -101,9 +103,19 @@ def _found(uv, image, places, wrap_u, wrap_v, nearest, n):
     if nearest:
         x, y = np.floor(x + half), np.floor(y + half)
     x0, y0 = np.floor(x), np.floor(y)
-    left, right = _wrapped(x0, width, wrap_u), _wrapped(x0 + 1, width, wrap_u)
-    top, bottom = first + _wrapped(y0, height, wrap_v) * width, first + _wrapped(y0 + 1, height, wrap_v) * width
+    column, row = int(x0) if abs(x0) < FAR else 0, int(y0) if abs(y0) < FAR else 0
+    left, right = _wrapped(column, width, wrap_u), _wrapped(column + 1, width, wrap_u)
+    top, bottom = first + _wrapped(row, height, wrap_v) * width, first + _wrapped(row + 1, height, wrap_v) * width
     return top + left, top + right, bottom + left, bottom + right, x - x0, y - y0
+
+
+@compiled
+def _any(g, n):
+    """True if row n of a gradient (N, C) is not zero; engines may have rows that are not in use."""
+    found = False
+    for k in range(g.shape[1]):
+        found |= g[n, k] != 0
+    return found
 
 
 @loop
@@ -134,6 +146,8 @@ def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t
 def _pull_uv(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, g, g_uv):
     """Fill rows [start, stop) of `g_uv` (N, 2) from `g` (N, C)."""
     for n in range(start, stop):
+        if not _any(g, n):
+            continue
         a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
         right = down = g.dtype.type(0)
         for k in range(table.shape[1]):
@@ -149,11 +163,12 @@ def _scatter(uv, image, places, wrap_u, wrap_v, nearest, g, g_table):
     """Add to `g_table` (M, C) the gradient of the texels, from `g` (N, C)."""
     one = g.dtype.type(1)
     for n in range(len(uv)):
+        if not _any(g, n):
+            continue
         a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
         for k in range(g.shape[1]):
             x = g[n, k]
-            if x != 0:
-                g_table[a, k] += (one - fx) * (one - fy) * x
-                g_table[b, k] += fx * (one - fy) * x
-                g_table[c, k] += (one - fx) * fy * x
-                g_table[d, k] += fx * fy * x
+            g_table[a, k] += (one - fx) * (one - fy) * x
+            g_table[b, k] += fx * (one - fy) * x
+            g_table[c, k] += (one - fx) * fy * x
+            g_table[d, k] += fx * fy * x
