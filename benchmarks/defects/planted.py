@@ -268,9 +268,9 @@ ARRAYS = [
     ),
     Defect(
         "textures are read half a texel off",
-        "rts/shading/textures.py",
-        "x, y = uv[:, 0] * width - 0.5,",
-        "x, y = uv[:, 0] * width,",
+        "rts/operations/texels_loops.py",
+        "x, y = uv[n, 0] * real(width) - half,",
+        "x, y = uv[n, 0] * real(width),",
         "shading mipmaps",
     ),
     Defect(

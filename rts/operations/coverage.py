@@ -28,8 +28,7 @@ def coverage(cells: Array, points: Array, planes: Array) -> Array:
         cells: (H · W, 2) x and y of the sample in each cell, of which only derivatives count; with alpha, if the
             samples are not opaque, (H · W, 3).
         points: (N, 3) x, y, and depth. Depth is of a kind that grows evenly on planes; it has no derivative.
-        planes: (H, W, 8) of the sample in each cell: depth, and the depth of a cell's width, 0 where there is no
-            sample; and `rts.operations.depth_planes`. At least 4 × 4.
+        planes: (H, W, 8) of the sample in each cell, see `depth_planes`. At least 4 × 4.
     """
     return COVERAGE(cells, points, planes)
 

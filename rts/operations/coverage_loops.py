@@ -96,15 +96,21 @@ def _corner(x, n):
 
 @compiled(inline="always")
 def _some_front(x, y, depth, planes):
-    """True if the plane of some cell around a point is in front of it: of most points none is."""
-    top, left = _corner(y, planes.shape[0]), _corner(x, planes.shape[1])
+    """True if the plane of some cell around a point may be in front of it: of most points none is.
+
+    In the dtype of planes, and without branches. So the bias is a little less than that of `_look`, which decides.
+    """
+    top, left, real = _corner(y, planes.shape[0]), _corner(x, planes.shape[1]), planes.dtype.type
+    below, limit, bias, one = real(y - top - 0.5), real(depth), real(0.999 * BIAS), real(1)
     found = False
     for j in range(4):
-        dy = y - (top + j + 0.5)
+        beside = real(x - left - 0.5)
         for i in range(4):
             z, unit = planes[top + j, left + i, 0], planes[top + j, left + i, 1]
             a, b = planes[top + j, left + i, 2], planes[top + j, left + i, 3]
-            found |= unit > 0 and z + a * (x - (left + i + 0.5)) + b * dy < depth - BIAS * (unit + abs(a) + abs(b))
+            found |= (unit > 0) & (z + a * beside + b * below + bias * (unit + abs(a) + abs(b)) < limit)
+            beside -= one
+        below -= one
     return found
 
 

@@ -11,11 +11,11 @@ from rts.operations.operation import Operation
 
 
 def depth_planes(even: Array, unit: Array) -> Array:
-    """The slopes of the surface in each cell along x and y, and how far beyond its centre its sides lie: (H, W, 6).
+    """The surface in each cell, (H, W, 8): `even`, `unit`, its slopes along x and y, and how far its sides lie away.
 
-    The last four are of the left, right, upper and lower side, in cells; by them motions are extrapolated from within.
-    On a smooth rim motions change with the root of the distance from the outline, as depths do. The result has no
-    derivative.
+    The last four are of the left, right, upper and lower side, in cells from the centre; by them motions are
+    extrapolated from within. On a smooth rim motions change with the root of the distance from the outline, as depths
+    do. The result has no derivative.
 
     Args:
         even: (H, W) depth, of a kind that grows evenly on planes.
@@ -30,7 +30,7 @@ def _specification(even: Array, unit: Array) -> Array:
         rise = _Rise(even, unit, axis)
         slopes.append(rise.slope())
         sides += [rise.beyond(-1), rise.beyond(1)]
-    return namespace(even).stack([*slopes, *sides], axis=-1)
+    return namespace(even).stack([even, unit, *slopes, *sides], axis=-1)
 
 
 class _Rise:
@@ -69,7 +69,7 @@ class _Rise:
 
 
 def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, ...]:
-    return *even, 6
+    return *even, 8
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:

@@ -13,7 +13,7 @@ WORK = 30
 
 
 def forward(even: np.ndarray, unit: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (H, W, 6) with slopes and sides."""
+    """Fill `out` (H, W, 8)."""
     parallel(_forward, len(even), even, unit, out, work=WORK * even.size)
 
 
@@ -57,6 +57,7 @@ def _forward(start, stop, even, unit, out):
     for y in range(start, stop):
         for x in range(width):
             z, u = even[y, x], unit[y, x]
+            out[y, x, 0], out[y, x, 1] = z, u
             for axis in range(2):
                 # The cells from two behind to two ahead.
                 if axis == 0:
@@ -70,6 +71,6 @@ def _forward(start, stop, even, unit, out):
                     is_far_back, is_back = unit[i, x] > 0, unit[j, x] > 0
                     is_ahead, is_far_ahead = unit[k, x] > 0, unit[m, x] > 0
                 is_back, is_ahead = is_back and u > 0, is_ahead and u > 0
-                out[y, x, axis] = _slope(ahead - z, is_ahead, z - back, is_back, u)
-                out[y, x, 2 + 2 * axis] = _beyond(z - ahead, ahead - far_ahead, is_ahead and is_far_ahead, u)
-                out[y, x, 3 + 2 * axis] = _beyond(z - back, back - far_back, is_back and is_far_back, u)
+                out[y, x, 2 + axis] = _slope(ahead - z, is_ahead, z - back, is_back, u)
+                out[y, x, 4 + 2 * axis] = _beyond(z - ahead, ahead - far_ahead, is_ahead and is_far_ahead, u)
+                out[y, x, 5 + 2 * axis] = _beyond(z - back, back - far_back, is_back and is_far_back, u)

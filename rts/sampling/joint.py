@@ -107,10 +107,16 @@ class Joint:
             fragments: on the host.
             covered: (K, H, W) bool, the cells in which there is one; None for all.
         """
+        from rts.sampling import joint_loops
+
         ids = fragments.triangle_ids
         covered = ids >= 0 if covered is None else covered
         packed = pack_fragments(fragments, self.proxy, None, covered)
-        row, tables = self._by_part(packed, ids[covered])
+        counts, *sorted_rows, row = joint_loops.by_part(
+            ids[covered], self.starts, packed.ids, packed.params, packed.row
+        )
+        ends = np.cumsum(np.maximum(counts, 1))[:-1]
+        tables = zip(*(np.split(x, ends) for x in sorted_rows), counts > 0, strict=True)
         context = self.scene.context
         real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
         arrays: list[np.ndarray] = [row, packed.depth, ids, packed.overflow]
@@ -131,28 +137,6 @@ class Joint:
             cells = Cells(used)
             samples.append(Samples(ids_of_part, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
         return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
-
-    def _by_part(
-        self, packed: Samples, triangles: np.ndarray
-    ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, bool]]]:
-        """The cells' rows; of each part ids and params, at least one row, and whether it is seen at all.
-
-        `triangles` (N,) are those of samples.
-        """
-        count = len(self.proxies)
-        part = (np.searchsorted(self.starts, triangles, side="right") - 1).astype(np.min_scalar_type(count))
-        order, counts = np.argsort(part, kind="stable"), np.bincount(part, minlength=count)
-        rows = np.maximum(counts, 1)
-        ends = np.cumsum(rows)
-        place = np.empty(max(1, len(part)), np.int32)
-        place[order] = np.arange(len(part)) + np.repeat(ends - rows - (np.cumsum(counts) - counts), counts)
-        ids = np.zeros((ends[-1], packed.ids.shape[1]), np.int32)
-        params = np.zeros((ends[-1], packed.params.shape[1]), np.float32)
-        if len(part):
-            ids[place], params[place] = packed.ids, packed.params
-        row = np.where(packed.row >= 0, place[packed.row], np.int32(-1))
-        bounds = itertools.pairwise([0, *ends.tolist()])
-        return row, [(ids[a:b], params[a:b], bool(seen)) for (a, b), seen in zip(bounds, counts, strict=True)]
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:

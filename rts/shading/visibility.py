@@ -112,8 +112,8 @@ def picture_of(
     middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
     even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
     unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
-    planes = xp.stack([depth_planes(even[k, ...], unit[k, ...]) for k in layers])
-    planes = xp.concat([even[..., None], unit[..., None], planes], axis=-1)
+    of_layers = [depth_planes(even[k, ...], unit[k, ...]) for k in layers]
+    planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
     cells: Array = xp.zeros_like(planes[..., :2]) if moving is None else moving
     cells = cells if alpha is None else xp.concat([cells, alpha], axis=-1)
     return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, middle, size)

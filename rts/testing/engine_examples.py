@@ -13,6 +13,7 @@ from rts.operations.combine import combine, interpolate
 from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map
 from rts.operations.take import take
+from rts.operations.texels import texels
 from rts.scene.rigid import rigid
 
 N = 6
@@ -37,6 +38,7 @@ OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
     "combine": (lambda rows, w: combine(rows, _ids(rows), w), [numbers(4, 3), numbers(N, 3, seed=1)]),
     "large_steps": (STEPS.decode, [numbers(4, 3)]),
     "rigid": (rigid, [numbers(6), numbers(3, seed=1)]),
+    "texels": (lambda table, uv: texels(table, uv, [(2, 3)]), [numbers(6, 3), numbers(N, 2, seed=1)]),
 }
 """The library's own operations, with operands."""
 
