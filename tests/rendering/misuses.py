@@ -267,6 +267,7 @@ GROUPS = {
     "save_views": {"path": lambda v: rts.save_views(v, []), "views": lambda v: rts.save_views("views.json", v)},
     "namespace": {"arrays": rts.namespace},
     "plugins": {"details": lambda v: rts.plugins("surfaces", details=v)},
+    "program": {"f": rts.program},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},
     "render_views": open_in(
         lambda **o: rts.render_views(**{"parts": PART, "cameras": [CAMERA] * 2, "size": SIZE, **o}),
