@@ -101,7 +101,7 @@ def _some_front(x, y, depth, planes):
     In the dtype of planes, and without branches. So the bias is a little less than that of `_look`, which decides.
     """
     top, left, real = _corner(y, planes.shape[0]), _corner(x, planes.shape[1]), planes.dtype.type
-    below, limit, bias, one = real(y - top - 0.5), real(depth), real(0.999 * BIAS), real(1)
+    below, limit, bias, one = real(y - top - 0.5), real(depth), real(0.99 * BIAS), real(1)
     found = False
     for j in range(4):
         beside = real(x - left - 0.5)

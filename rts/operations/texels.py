@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,32 +31,32 @@ def texels(
         uv: (N, 2) float, u to the right and v up; (0, 0) is the lower left corner of an image.
         sizes: (height, width) of each image, in their order in the table.
         image: (N,) integers, which image each lookup is of, from 0 on; None for the first.
-        wrap: continuations outside [0, 1] along u and v: "repeat", "mirror" or "clamp".
+        wrap: continuations outside [0, 1] along u and v: "repeat" or "mirror"; any other text is "clamp".
         filter: "nearest" takes the texel around a point, without derivative in uv; "linear" does not.
     """
-    engine = engine_of(table, uv)
-    places, first = _places(tuple(sizes))
-    number = engine.constant(first, uv) if image is None else namespace(image).astype(image, namespace(image).int32)
-    return TEXELS(table, uv, number, engine.constant(places, uv), wrap=wrap, filter=filter)
+    xp = namespace(table, uv)
+    if not xp.isdtype(uv.dtype, "real floating"):
+        uv = xp.astype(uv, table.dtype)
+    number = uv[:0, 0] if image is None else image
+    return TEXELS(table, uv, xp.astype(number, xp.int32), sizes=tuple(sizes), wrap=wrap, filter=filter)
 
 
-@functools.cache
-def _places(sizes: tuple[tuple[int, ...], ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Height, width and first row in the table (L, 3) of images; and the number of the first (1,); read-only."""
+def places_of(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Height, width and first row in the table (L, 3) int32 of images."""
     counts = np.array([height * width for height, width in sizes])
-    first = np.cumsum(counts) - counts
-    places = np.stack([*np.array(sizes).T, first], axis=1).astype(np.int32)
-    number = np.zeros(1, np.int32)
-    places.flags.writeable = number.flags.writeable = False
-    return places, number
+    return np.stack([*np.array(sizes).T, np.cumsum(counts) - counts], axis=1).astype(np.int32)
 
 
 def _specification(
-    table: Array, uv: Array, image: Array, places: Array, *, wrap: tuple[str, str], filter: str
+    table: Array, uv: Array, image: Array, *, sizes: tuple[tuple[int, ...], ...], wrap: tuple[str, str], filter: str
 ) -> Array:
     xp = namespace(table, uv)
-    of_rows = xp.take(places, image, axis=0)
-    height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
+    if image.shape[0]:
+        of_rows = xp.take(engine_of(table, uv).constant(places_of(sizes), uv), image, axis=0)
+        height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
+        step, first = of_rows[:, 1], of_rows[:, 2]
+    else:
+        height, width, step, first = *sizes[0], sizes[0][1], 0
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     if filter == "nearest":
         x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
@@ -66,13 +65,13 @@ def _specification(
     rows, columns = (
         [_wrapped(a + i, n, w) for i in range(2)] for a, n, w in ((y0, height, wrap[1]), (x0, width, wrap[0]))
     )
-    index = xp.concat([rows[dy] * of_rows[:, 1] + columns[dx] + of_rows[:, 2] for dy, dx in CORNERS])
+    index = xp.concat([rows[dy] * step + columns[dx] + first for dy, dx in CORNERS])
     found = xp.reshape(xp.take(table, index, axis=0), (4, -1, table.shape[1]))
     upper, lower = (found[i, ...] + fx * (found[i + 1, ...] - found[i, ...]) for i in (0, 2))
     return upper + fy * (lower - upper)
 
 
-def _wrapped(index: Array, count: Array, wrap: str) -> Array:
+def _wrapped(index: Array, count: Any, wrap: str) -> Array:
     """Whole-numbered floats as int32 in [0, count), by `wrap` where they lie outside; 0 for NaN."""
     xp = namespace(index)
     index = xp.where(index - index == 0, index, 0.0)  # NaN and infinity have no texel; they would be out of range.
@@ -90,12 +89,17 @@ def _shape(table: tuple[int, ...], uv: tuple[int, ...], *_: tuple[int, ...], **_
     return uv[0], table[1]
 
 
-def _check(table: np.ndarray, uv: np.ndarray, image: np.ndarray, places: np.ndarray, **_: Any) -> None:
-    if uv.shape[1] != 2 or places.shape[1] != 3 or not (len(image) == 1 or len(image) >= len(uv)):
-        shapes = ", ".join(str(x.shape) for x in (table, uv, image, places))
-        raise InputError(f"table, uv, image and places have shapes {shapes}; expected (M, C), (N, 2), (N,), (L, 3)")
-    if image.size and not 0 <= image.min() <= image.max() < len(places):
-        raise InputError(f"images from {image.min()} to {image.max()} were asked for, of {len(places)}")
+def _check(
+    table: np.ndarray, uv: np.ndarray, image: np.ndarray, *, sizes: tuple[tuple[int, ...], ...], **_: object
+) -> None:
+    if uv.shape[1] != 2 or 0 < len(image) < len(uv) or sum(h * w for h, w in sizes) > len(table):
+        shapes = ", ".join(str(x.shape) for x in (table, uv, image))
+        raise InputError(
+            f"table, uv and image have shapes {shapes}, for images of sizes {sizes}; expected (M, C), with a row for "
+            f"each texel, (N, 2), (N,)"
+        )
+    if image.size and not 0 <= image.min() <= image.max() < len(sizes):
+        raise InputError(f"images from {image.min()} to {image.max()} were asked for, of {len(sizes)}")
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:
@@ -107,7 +111,7 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 TEXELS = Operation.of_loops(
     "rts.texels",
     _specification,
-    (2, 2, 1, 2),
+    (2, 2, 1),
     _shape,
     _loops,
     _check,
@@ -115,4 +119,6 @@ TEXELS = Operation.of_loops(
     packed=(1,),
     packed_result=True,
 )
-"""The operation of `texels`, on table (M, C), uv (N, 2), numbers of images (N,) or (1,), and their places (L, 3)."""
+"""The operation of `texels`, on table (M, C), uv (N, 2), and numbers of images (N,), or (0,) where all are the first.
+
+Parameters: `sizes`, `wrap` and `filter`, as there."""

@@ -8,37 +8,38 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.compiling.threads import parallel
+from rts.compiling.threads import parallel, read_only
+from rts.operations.texels import places_of
 
-WRAPS = {"clamp": 0, "repeat": 1, "mirror": 2}
-"""Numbers of continuations."""
-FAR = np.float32(2**30)
-"""Farther out any texel serves, and for NaN, whose shares are none."""
+WRAPS = {"repeat": 1, "mirror": 2}
+"""Numbers of continuations; 0 is that of "clamp"."""
+FAR = 2.0**53
+"""Texels farther out count as this one, which is as an integer is."""
 
 
 def forward(
     table: np.ndarray,
     uv: np.ndarray,
     image: np.ndarray,
-    places: np.ndarray,
     out: np.ndarray,
     *,
+    sizes: tuple[tuple[int, ...], ...],
     wrap: tuple[str, str],
     filter: str,
 ) -> None:
     """Fill `out` (N, C) with the lookups."""
-    _parallel(_look_up, table, uv, image, places, wrap, filter, out)
+    _parallel(_look_up, table, uv, image, sizes, wrap, filter, out)
 
 
 def push(
     table: np.ndarray,
     uv: np.ndarray,
     image: np.ndarray,
-    places: np.ndarray,
     t_table: np.ndarray | None,
     t_uv: np.ndarray | None,
     out: np.ndarray,
     *,
+    sizes: tuple[tuple[int, ...], ...],
     wrap: tuple[str, str],
     filter: str,
 ) -> None:
@@ -46,37 +47,37 @@ def push(
     if t_table is None:
         out[...] = 0
     else:
-        forward(t_table, uv, image, places, out, wrap=wrap, filter=filter)
+        forward(t_table, uv, image, out, sizes=sizes, wrap=wrap, filter=filter)
     if t_uv is not None and filter != "nearest":
-        _parallel(_add_moved, table, uv, image, places, wrap, filter, t_uv, out)
+        _parallel(_add_moved, table, uv, image, sizes, wrap, filter, t_uv, out)
 
 
 def pull(
     table: np.ndarray,
     uv: np.ndarray,
     image: np.ndarray,
-    places: np.ndarray,
     g: np.ndarray,
     g_table: np.ndarray | None,
     g_uv: np.ndarray | None,
     *,
+    sizes: tuple[tuple[int, ...], ...],
     wrap: tuple[str, str],
     filter: str,
 ) -> None:
     """Pull back the gradient `g` (N, C) of the result: fill `g_table` and `g_uv`, given as zeros, unless None."""
     if g_table is not None:
-        _scatter(uv, image, places, *_numbers(wrap, filter), g, g_table)
+        _scatter(uv, image, *_numbers(sizes, wrap, filter), g, g_table)
     if g_uv is not None and filter != "nearest":
-        _parallel(_pull_uv, table, uv, image, places, wrap, filter, g, g_uv)
+        _parallel(_pull_uv, table, uv, image, sizes, wrap, filter, g, g_uv)
 
 
-def _parallel(function, table, uv, image, places, wrap, filter, *others):
+def _parallel(function, table, uv, image, sizes, wrap, filter, *others):
     work = (30 + 6 * table.shape[1]) * len(uv)
-    parallel(function, len(uv), table, uv, image, places, *_numbers(wrap, filter), *others, work=work)
+    parallel(function, len(uv), table, uv, image, *_numbers(sizes, wrap, filter), *others, work=work)
 
 
-def _numbers(wrap, filter):
-    return WRAPS[wrap[0]], WRAPS[wrap[1]], filter == "nearest"
+def _numbers(sizes, wrap, filter):
+    return read_only(places_of(sizes)), WRAPS.get(wrap[0], 0), WRAPS.get(wrap[1], 0), filter == "nearest"
 
 
 @compiled
@@ -96,14 +97,16 @@ def _wrapped(index, count, wrap):
 @compiled
 def _found(uv, image, places, wrap_u, wrap_v, nearest, n):
     """The four texels of lookup n, and the shares of the right and the lower ones."""
-    place = image[n if len(image) > 1 else 0]
+    place = image[n] if len(image) > 0 else 0
     height, width, first = places[place, 0], places[place, 1], places[place, 2]
     real, half = uv.dtype.type, uv.dtype.type(0.5)
     x, y = uv[n, 0] * real(width) - half, (real(1) - uv[n, 1]) * real(height) - half
     if nearest:
         x, y = np.floor(x + half), np.floor(y + half)
     x0, y0 = np.floor(x), np.floor(y)
-    column, row = int(x0) if abs(x0) < FAR else 0, int(y0) if abs(y0) < FAR else 0
+    # NaN names some texel, and its shares are none.
+    column = int(min(max(x0, -FAR), FAR)) if x0 == x0 else 0
+    row = int(min(max(y0, -FAR), FAR)) if y0 == y0 else 0
     left, right = _wrapped(column, width, wrap_u), _wrapped(column + 1, width, wrap_u)
     top, bottom = first + _wrapped(row, height, wrap_v) * width, first + _wrapped(row + 1, height, wrap_v) * width
     return top + left, top + right, bottom + left, bottom + right, x - x0, y - y0
@@ -134,7 +137,7 @@ def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t
     """Add to rows [start, stop) of `out` (N, C) the derivative along `t_uv` (N, 2)."""
     for n in range(start, stop):
         a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
-        place = image[n if len(image) > 1 else 0]
+        place = image[n] if len(image) > 0 else 0
         right, down = t_uv[n, 0] * places[place, 1], -t_uv[n, 1] * places[place, 0]
         for k in range(table.shape[1]):
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
@@ -154,7 +157,7 @@ def _pull_uv(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, g, 
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
             right += g[n, k] * (upper + fy * (lower - upper))
             down += g[n, k] * (table[c, k] + fx * lower - table[a, k] - fx * upper)
-        place = image[n if len(image) > 1 else 0]
+        place = image[n] if len(image) > 0 else 0
         g_uv[n, 0], g_uv[n, 1] = right * places[place, 1], -down * places[place, 0]
 
 

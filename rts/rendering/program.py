@@ -19,8 +19,8 @@ def program(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
 
     For a GPU, where torch otherwise launches hundreds of small operators one by one. Call `rts.sample` before, and pass
     what it gives: numbers of samples and of breaks may change from call to call. So may values of arguments, which have
-    their derivatives. All else stays as it is at the first call: arrays that `f` closes over, other shapes, dtypes,
-    settings. For other ones a further program is compiled.
+    their derivatives. For other shapes, dtypes or settings a further program is compiled; by torch also where there is
+    no sample or break, or one. Arrays that `f` closes over are those of the first call.
 
     torch compiles for a minute or two, jax for seconds. By NumPy `f` runs as it is.
 

@@ -53,11 +53,13 @@ def sample_texture(
         (N, C).
 
     Raises:
-        InputError: the texture has another shape, or no floating numbers.
+        InputError: the texture or uv has another shape, or the texture no floating numbers.
     """
     shape = shape_of(texture)
     if len(shape) != 3 or shape[2] not in (1, 3, 4) or 0 in shape:
         raise InputError(f"the texture {described(texture)}; expected (h, w, C) with C = 1, 3 or 4")
+    if shape_of(uv)[1:] != (2,) or len(shape_of(uv)) != 2:
+        raise InputError(f"uv {described(uv)}; expected (N, 2)")
     xp = namespace(texture, uv)
     if not xp.isdtype(texture.dtype, "real floating"):
         raise InputError(

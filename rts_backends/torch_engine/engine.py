@@ -32,6 +32,9 @@ _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, tor
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
 
+FEW = 16
+"""The most products of a sum that are made one by one."""
+
 _CPU = torch.device("cpu")
 
 _sent: dict[tuple[int, torch.device], tuple[weakref.ref, torch.Tensor]] = {}
@@ -113,9 +116,15 @@ class TorchEngine(Engine):
         return {x.device for x in arrays if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu)}
 
     def product(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        """See `Engine.product`: by elements on devices, whose matrix units may be set to round, and in `autocast`."""
-        exact = a.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
-        return a @ b if exact else (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
+        """See `Engine.product`: by elements on devices, whose matrix units may be set to round, and in `autocast`.
+
+        Of large matrices in float64 there, which is never rounded: elements would take too much memory.
+        """
+        if a.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu"):
+            return a @ b
+        if a.shape[-1] <= FEW or a.device.type == "mps":  # Which has no float64.
+            return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)
+        return (a.double() @ b.double()).to(torch.promote_types(a.dtype, b.dtype))
 
     def plain(self, x: torch.Tensor) -> bool:
         """True for a dense tensor with values, of a dtype in `_REAL`, while torch's forward mode is off."""

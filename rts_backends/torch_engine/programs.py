@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from rts import InputError, RtsError
-from rts.plugin_api.arrays import Tree
+from rts.plugin_api.arrays import Tree, exemplar, map_leaves
 
 
 class Programs:
@@ -32,23 +33,37 @@ class Programs:
 
     def __call__(self, *args: Tree) -> Tree:
         """What the function returns, by its program for such arguments."""
+        args = map_leaves(lambda x: x, args)  # Mappings of any class as dicts, which torch's trees know.
         found, structure = _pytree.tree_flatten(args)
-        like = next(x for x in found if isinstance(x, Tensor))
+        like = exemplar(args)
         found = [self._constant(x, like) if isinstance(x, np.ndarray) else x for x in found]
         tensors = [x for x in found if isinstance(x, Tensor)]
-        others = [_TENSOR if isinstance(x, Tensor) else x for x in found]
-        kind = structure, others, [(x.dtype, x.device, x.requires_grad) for x in tensors], torch.is_grad_enabled()
+        others = [
+            _TENSOR if isinstance(x, Tensor) else (type(x), repr(x) if isinstance(x, float) else x) for x in found
+        ]
+        on = tensors[0].device.type
+        modes = torch.is_grad_enabled(), torch.is_autocast_enabled(on) and torch.get_autocast_dtype(on)
+        kind = structure, others, [(x.dtype, x.device, x.requires_grad) for x in tensors], modes
         for program in self._programs:
             if program.kind == kind and program.takes(tensors):
                 return program.call(tensors)
         axes = structure.flatten_up_to(self._varying(args))
         free = [axis for axis, x in zip(axes, others, strict=True) if x is _TENSOR]
-        self._programs.append(self._traced(kind, tensors, free))
-        return self._programs[-1].call(tensors)
+        program = self._traced(kind, [x if x is _TENSOR else found[i] for i, x in enumerate(others)], tensors, free)
+        # Else torch takes lengths that are equal now to be equal always, and compiles anew where they are not.
+        for x, shape, axis in zip(tensors, program.shapes, free, strict=True):
+            if axis >= 0 and isinstance(shape[axis], str):
+                torch._dynamo.mark_dynamic(x, axis)
+        result = program.call(tensors)
+        self._programs.append(program)
+        return result
 
-    def _traced(self, kind: tuple, tensors: list[Tensor], free: Sequence[int]) -> _Program:
-        """The program for arguments of a kind. The axis `free` of each may have another length, if it is not −1."""
-        structure, others, *_ = kind
+    def _traced(self, kind: tuple, others: list, tensors: list[Tensor], free: Sequence[int]) -> _Program:
+        """The program for arguments of a kind, whose leaves are `others` and tensors.
+
+        The axis `free` of each tensor may have another length, if it is not −1.
+        """
+        structure = kind[0]
 
         def called(given: Sequence[Tensor]) -> Tree:
             rest = iter(given)
@@ -73,7 +88,8 @@ class Programs:
                 )
         inputs = [node for node in traced.graph.nodes if node.name in traced.graph_signature.user_inputs]
         shapes = [tuple(n if type(n) is int else str(n) for n in node.meta["val"].shape) for node in inputs]
-        return _Program(kind, shapes, torch.compile(traced.module(), dynamic=True, **self._options))
+        limits = {str(name): (int(max(r.lower, 2)), r.upper) for name, r in traced.range_constraints.items()}
+        return _Program(kind, shapes, limits, torch.compile(traced.module(), **{"dynamic": True, **self._options}))
 
 
 _TENSOR = object()
@@ -97,22 +113,25 @@ class _Program(NamedTuple):
     Attributes:
         kind: what else has to be the same: structure of the arguments, other leaves, dtypes, devices, gradients.
         shapes: the shape of each tensor; lengths that may change have names.
+        limits: the least and the largest length of each name: `f` may ask whether there are many.
         call: tensors → a tree.
     """
 
     kind: tuple
     shapes: Sequence[tuple[int | str, ...]]
+    limits: Mapping[str, tuple[int, Any]]
     call: Callable[[Sequence[Tensor]], Tree]
 
     def takes(self, tensors: Sequence[Tensor]) -> bool:
-        """True if tensors have these shapes. Lengths of one name are the same, and at least two, as torch has it."""
+        """True if tensors have these shapes. Lengths of one name are the same, and within its limits."""
         named: dict[str, int] = {}
         for shape, x in zip(self.shapes, tensors, strict=True):
             if len(shape) != x.ndim:
                 return False
             for length, here in zip(shape, x.shape, strict=True):
                 if isinstance(length, str):
-                    length = named.setdefault(length, here) if here > 1 else -1
+                    least, most = self.limits.get(length, (2, math.inf))
+                    length = named.setdefault(length, here) if least <= here <= most else -1
                 if length != here:
                     return False
         return True

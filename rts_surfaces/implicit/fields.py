@@ -41,7 +41,7 @@ def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
     """The least signed distance (M,) of points (M, 3) to n spheres, whose centres lie in the plane y = 0.
 
     θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. The search
-    for it has no derivatives, and goes by blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
+    for it has no derivatives, and goes by blocks of `BLOCK` points, so its memory is of the order of n.
     """
     xp, centers = namespace(points), _entry(theta, "centers", ("n", 2))
     radii = _entry(theta, "radii", (centers.shape[0],))

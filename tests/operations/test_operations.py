@@ -297,26 +297,46 @@ def test_unit_vectors_of_any_length_and_the_derivative_of_zero(dtype):
 
 
 def test_lookups_that_are_nowhere_name_no_texel():
-    """NaN and infinite coordinates give NaN, by loops and by array code; far ones are as exact as their dtype."""
+    """NaN and infinite coordinates give NaN, by loops and by array code."""
     table, nowhere = RNG.random((12, 3)).astype(np.float32), np.float32([[np.nan, 0.5], [0.5, np.inf], [1e30, 0.5]])
     for wrap in ("repeat", "mirror", "clamp"):
         found = texels(table, nowhere, [(3, 4)], wrap=(wrap, wrap))
         with np.errstate(invalid="ignore"):
             by_arrays = TEXELS.specification(
-                table, nowhere, np.int32([0]), np.int32([[3, 4, 0]]), wrap=(wrap, wrap), filter="linear"
+                table, nowhere, np.zeros(0, np.int32), sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
             )
         assert np.isnan(found[:2]).all() and np.isfinite(found[2]).all()
         np.testing.assert_array_equal(np.isnan(found), np.isnan(by_arrays))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_far_lookups_are_those_of_array_code(dtype):
+    table = RNG.random((12, 3)).astype(dtype)
+    far = np.array([[s * 10.0**n, 0.4] for n in range(2, 12) for s in (-1, 1)], dtype)
+    for wrap in ("repeat", "clamp"):  # By "clamp" the first or the last texel of a row, however far.
+        found = texels(table, far, [(3, 4)], wrap=(wrap, wrap))
+        by_arrays = TEXELS.specification(
+            table, far, np.zeros(0, np.int32), sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
+        )
+        np.testing.assert_allclose(found, by_arrays, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_whole_numbers_are_coordinates(target):
+    table, whole = RNG.random((12, 3)).astype(np.float32), np.array([[0, 0], [1, 1]], np.int32)
+    found, expected = (texels(*arrays(target, (table, uv)), [(3, 4)]) for uv in (whole, whole.astype(np.float32)))
+    np.testing.assert_allclose(to_numpy(found), to_numpy(expected), atol=1e-6)
 
 
 def test_images_that_are_not_there_are_refused():
     table, uv = np.zeros((12, 3), np.float32), np.zeros((2, 2), np.float32)
     with pytest.raises(rts.InputError, match="images from 0 to 1 were asked for, of 1"):
         texels(table, uv, [(3, 4)], np.int32([0, 1]))
-    with pytest.raises(
-        rts.InputError, match=r"shapes \(12, 3\), \(2, 3\), \(1,\), \(1, 3\); expected \(M, C\), \(N, 2\)"
-    ):
-        texels(table, np.zeros((2, 3), np.float32), [(3, 4)])
+    for wrong, sizes in ((np.zeros((2, 3), np.float32), (3, 4)), (uv, (30, 40))):
+        with pytest.raises(
+            rts.InputError, match=r"for images of sizes .* expected \(M, C\), with a row for each texel"
+        ):
+            texels(table, wrong, [sizes])
 
 
 # ------------------------------------------------------------------------------------------- all of them, by the kit
@@ -330,7 +350,7 @@ def cases():
     points, places = rng.normal(size=(20, 3)), np.array([[0.0, 0], [9, 9], [20, 10]])
     view = np.array([1] * 8 + [3] * 12, np.int32)
     table, uv = rng.random((3 * 4 + 5 * 2, 3)), 1.5 * rng.normal(size=(20, 2))
-    image, sizes = rng.integers(0, 2, 20).astype(np.int32), np.array([[3, 4, 0], [5, 2, 12]], np.int32)
+    image, sizes = rng.integers(0, 2, 20).astype(np.int32), {"sizes": ((3, 4), (5, 2))}
     return {
         "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
         "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
@@ -341,9 +361,9 @@ def cases():
         "projection": (projection.PROJECTION, [ahead[0], points], {}),
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
         "unit": (UNIT, [points], {}),
-        "texels": (TEXELS, [table, uv, image, sizes], {"wrap": ("repeat", "mirror"), "filter": "linear"}),
-        "texels of one": (TEXELS, [table, uv, np.int32([1]), sizes], {"wrap": ("clamp", "repeat"), "filter": "linear"}),
-        "nearest texels": (TEXELS, [table, uv, image, sizes], {"wrap": ("mirror", "clamp"), "filter": "nearest"}),
+        "texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("repeat", "mirror"), "filter": "linear"}),
+        "texels of one": (TEXELS, [table, uv, image[:0]], {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"}),
+        "nearest texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"}),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 

@@ -1,5 +1,8 @@
 """`rts.program`: one program for each kind of arguments, with the values and derivatives of the function itself."""
 
+from dataclasses import replace
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 from helpers import icosphere, to_numpy
@@ -121,6 +124,60 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
     assert f(np.ones(3), all_samples[0], 2).dtype == torch.float32 and len(programs) == 7  # As a tensor of float32.
     for sampled in all_samples:
         checked(7, x, sampled)
+
+
+def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
+    """Of a ball inside the image there are as many breaks as segments, and across its border there are not."""
+    torch, programs = pytest.importorskip("torch"), []
+
+    def backend(graph, inputs):
+        programs.append(graph)
+        return graph
+
+    f, counts = rts.program(lambda s: s.outlines.place.sum() + s.outlines.pull.sum(), backend=backend), []
+    for x in (0, 0.1, 0.9):
+        sampled = rts.sample(PART.replace(transform=rts.rigid(torch.tensor([0, 0, 0, x, 0, -0.5]))), CAMERA, SIZE)
+        found = sampled.outlines.place.sum() + sampled.outlines.pull.sum()
+        assert f(sampled).item() == pytest.approx(found.item(), rel=1e-5)
+        counts.append(len(sampled.outlines.place) - len(sampled.outlines.pull))
+    assert counts[0] == 0 != counts[2] and len(programs) == 1
+
+
+def test_torch_tells_values_that_are_no_tensors_apart():
+    torch = pytest.importorskip("torch")
+    programs, x = [], torch.ones(2, dtype=torch.int64)
+
+    def backend(graph, inputs):
+        programs.append(graph)
+        return graph
+
+    f = rts.program(lambda tree, k: tree["x"] * k, backend=backend, dynamic=True)
+    assert f({"x": x}, 2).dtype == torch.int64 and f({"x": x}, 2.0).dtype == torch.float32
+    assert len(programs) == 2
+    assert f(MappingProxyType({"x": x}), 2).tolist() == [2, 2] and len(programs) == 2
+    for _ in range(2):
+        assert f({"x": x}, float("nan")).isnan().all() and len(programs) == 3
+    with torch.autocast("cpu", torch.bfloat16):
+        f({"x": x}, 2)
+    assert len(programs) == 4
+
+
+def test_torch_traces_anew_where_a_function_asks_how_many_samples_there_are():
+    torch = pytest.importorskip("torch")
+
+    def doubled(sampled):
+        params = sampled.samples[0].params
+        return params.sum() * (2 if params.shape[0] > 100 else 1)
+
+    f, counts = rts.program(doubled, backend="eager"), []
+    for size in ((30, 30), (4, 4), (5, 5), (20, 20)):
+        sampled = rts.sample(PART.replace(transform=rts.rigid(torch.zeros(6))), CAMERA, size)
+        # Of one shape of cells, so that nothing else differs.
+        (samples_of,), cells = sampled.samples, sampled.cells.map(lambda x: x[..., :8, :8])
+        sampled = replace(sampled, cells=cells, samples=(replace(samples_of, cells=cells),), outlines=None)
+        assert f(sampled).item() == pytest.approx(doubled(sampled).item(), rel=1e-5)
+        counts.append(len(sampled.samples[0].params))
+    assert counts[0] > 100 > counts[1]
 
 
 @pytest.mark.thorough

@@ -79,6 +79,20 @@ def test_each_axis_has_its_wrap_and_nearest_takes_the_texel_around_a_point(targe
         np.testing.assert_allclose(found, expected[::2], atol=1e-5)
 
 
+def test_torch_compiles_lookups_of_textures_of_several_sizes():
+    torch = pytest.importorskip("torch")
+    compiled = torch.compile(sample_texture, backend="eager", fullgraph=True)
+    for height in (3, 5):
+        texture, uv = (torch.rand(*shape) for shape in ((height, 4, 3), (6, 2)))
+        torch.testing.assert_close(compiled(texture, uv), sample_texture(texture, uv))
+
+
+def test_texture_coordinates_of_another_shape_are_refused():
+    for shape in ((5,), (5, 3)):
+        with pytest.raises(InputError, match=r"^uv has shape .*; expected \(N, 2\)"):
+            sample_texture(TEXTURE, np.zeros(shape))
+
+
 def test_repeat_blends_the_two_ends_and_clamp_does_not():
     uv = np.array([(0.0, texel(1, 0)[1])])
     ends = (TEXTURE[1, 0] + TEXTURE[1, 3]) / 2
