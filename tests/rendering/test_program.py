@@ -19,6 +19,13 @@ POSES = np.array([[0.0] * 6, [0.1, 0.2, 0, 0.1, -0.1, 0.3], [0.3, 0, 0.1, 2.0, -
 CARD = np.array([[-0.7, -0.9, 0.6], [1.1, -1, 0.4], [1, 0.9, -0.3]])
 
 
+def torch_with_programs():
+    torch = pytest.importorskip("torch")
+    if not hasattr(torch.export.Dim, "AUTO"):
+        pytest.skip(f"torch {torch.__version__} makes no programs")
+    return torch
+
+
 def engine_arrays(name, tree):
     if name == "numpy":
         return tree
@@ -73,7 +80,7 @@ def test_jax_compiles_the_function():
 
 @pytest.mark.thorough
 def test_torch_makes_one_program_of_any_number_of_samples():
-    torch, programs = pytest.importorskip("torch"), []
+    torch, programs = torch_with_programs(), []
 
     def backend(graph, inputs):
         programs.append(graph)
@@ -94,7 +101,7 @@ def test_torch_makes_one_program_of_any_number_of_samples():
 
 
 def test_torch_makes_a_program_for_each_kind_of_arguments():
-    torch, programs = pytest.importorskip("torch"), []
+    torch, programs = torch_with_programs(), []
 
     def backend(graph, inputs):
         programs.append(graph)
@@ -128,7 +135,7 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
 
 def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
     """Of a ball inside the image there are as many breaks as segments, and across its border there are not."""
-    torch, programs = pytest.importorskip("torch"), []
+    torch, programs = torch_with_programs(), []
 
     def backend(graph, inputs):
         programs.append(graph)
@@ -144,7 +151,7 @@ def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
 
 
 def test_torch_tells_values_that_are_no_tensors_apart():
-    torch = pytest.importorskip("torch")
+    torch = torch_with_programs()
     programs, x = [], torch.ones(2, dtype=torch.int64)
 
     def backend(graph, inputs):
@@ -163,7 +170,7 @@ def test_torch_tells_values_that_are_no_tensors_apart():
 
 
 def test_torch_traces_anew_where_a_function_asks_how_many_samples_there_are():
-    torch = pytest.importorskip("torch")
+    torch = torch_with_programs()
 
     def doubled(sampled):
         params = sampled.samples[0].params
@@ -182,6 +189,7 @@ def test_torch_traces_anew_where_a_function_asks_how_many_samples_there_are():
 
 @pytest.mark.thorough
 def test_torch_has_no_gradient_for_what_a_function_closes_over():
+    torch_with_programs()
     arrays = arrays_of("torch", POSES[1])
     sampled, pose = samples(arrays, PART), arrays["pose"].clone().requires_grad_()
     f = rts.program(lambda s: loss({**arrays, "pose": pose}, PART, s), backend="eager")
@@ -190,6 +198,7 @@ def test_torch_has_no_gradient_for_what_a_function_closes_over():
 
 
 def test_torch_refuses_a_function_that_samples():
+    torch_with_programs()
     arrays = arrays_of("torch", POSES[1])
     f = rts.program(lambda a: rts.render(scene(a, PART), CAMERA, SIZE).sum(), backend="eager")
     with pytest.raises(rts.InputError, match="cannot trace the function of rts.program .* call rts.sample before it"):
@@ -197,6 +206,7 @@ def test_torch_refuses_a_function_that_samples():
 
 
 def test_torch_passes_the_library_s_own_errors_on():
+    torch_with_programs()
     arrays = arrays_of("torch", POSES[1])
     f = rts.program(lambda a: rts.rigid(a["pose"][:5]), backend="eager")
     with pytest.raises(rts.InputError, match="^pose .*expected"):
