@@ -41,17 +41,13 @@ def texels(
     return TEXELS(table, uv, xp.astype(number, xp.int32), sizes=tuple(sizes), wrap=wrap, filter=filter)
 
 
-def places_of(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
-    """Height, width and first row in the table (L, 3) int32 of images."""
-    counts = np.array([height * width for height, width in sizes])
-    return np.stack([*np.array(sizes).T, np.cumsum(counts) - counts], axis=1).astype(np.int32)
-
-
 def _specification(
     table: Array, uv: Array, image: Array, *, sizes: tuple[tuple[int, ...], ...], wrap: tuple[str, str], filter: str
 ) -> Array:
     xp = namespace(table, uv)
     if image.shape[0]:
+        from rts.operations.texels_loops import places_of
+
         of_rows = xp.take(engine_of(table, uv).constant(places_of(sizes), uv), image, axis=0)
         height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
         step, first = of_rows[:, 1], of_rows[:, 2]

@@ -5,16 +5,23 @@ Operands are those of `rts.operations.texels.TEXELS`. Gradients of texels are ad
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel, read_only
-from rts.operations.texels import places_of
 
 WRAPS = {"repeat": 1, "mirror": 2}
 """Numbers of continuations; 0 is that of "clamp"."""
 FAR = 2.0**53
 """Texels farther out count as this one, which is as an integer is."""
+
+
+def places_of(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Height, width and first row in the table (L, 3) int32 of images."""
+    counts = np.array([height * width for height, width in sizes])
+    return np.stack([*np.array(sizes).T, np.cumsum(counts) - counts], axis=1).astype(np.int32)
 
 
 def forward(

@@ -134,7 +134,7 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
 
 
 def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
-    """Of a ball inside the image there are as many breaks as segments, and across its border there are not."""
+    """A ball inside the image has as many breaks as segments; one across its border has not."""
     torch, programs = torch_with_programs(), []
 
     def backend(graph, inputs):
