@@ -68,6 +68,7 @@ def _varying(tree: Tree) -> Tree:
 
 
 def _axis_of_samples(shape: tuple[int, ...], cells: tuple[int, ...]) -> int:
+    """The axis of samples, or of breaks, of an array of this shape; −1 for one of `cells` (H, W)."""
     if not shape or shape[-2:] == cells:
         return -1
     # Of several parts each has the cells that it is seen in, (·, 1, M).

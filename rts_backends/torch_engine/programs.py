@@ -50,7 +50,8 @@ class Programs:
         axes = structure.flatten_up_to(self._varying(args))
         free = [axis for axis, x in zip(axes, others, strict=True) if x is _TENSOR]
         program = self._traced(kind, [x if x is _TENSOR else found[i] for i, x in enumerate(others)], tensors, free)
-        # Else torch takes lengths that are equal now to be equal always, and compiles anew where they are not.
+        # Else torch takes lengths that are equal now to be equal always, and compiles anew where they are not. Its manual
+        # has this function, for all its module's name.
         for x, shape, axis in zip(tensors, program.shapes, free, strict=True):
             if axis >= 0 and isinstance(shape[axis], str):
                 torch._dynamo.mark_dynamic(x, axis)
@@ -111,7 +112,7 @@ class _Program(NamedTuple):
     """A compiled function of tensors.
 
     Attributes:
-        kind: what else has to be the same: structure of the arguments, other leaves, dtypes, devices, gradients.
+        kind: what else has to be the same: structure of the arguments, other leaves, dtypes, devices, gradients, modes.
         shapes: the shape of each tensor; lengths that may change have names.
         limits: the least and the largest length of each name: `f` may ask whether there are many.
         call: tensors → a tree.
