@@ -50,8 +50,8 @@ class Programs:
         axes = structure.flatten_up_to(self._varying(args))
         free = [axis for axis, x in zip(axes, others, strict=True) if x is _TENSOR]
         program = self._traced(kind, [x if x is _TENSOR else found[i] for i, x in enumerate(others)], tensors, free)
-        # Else torch takes lengths that are equal now to be equal always, and compiles anew where they are not. Its manual
-        # has this function, for all its module's name.
+        # Else torch takes lengths that are equal now to be equal always, and compiles anew where they are not.
+        # Its manual has this function, for all its module's name.
         for x, shape, axis in zip(tensors, program.shapes, free, strict=True):
             if axis >= 0 and isinstance(shape[axis], str):
                 torch._dynamo.mark_dynamic(x, axis)
