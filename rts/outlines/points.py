@@ -202,7 +202,7 @@ class Points:
     def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
         sheets = self._parts[part][-1]
-        return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
+        return sheets.at(triangles, points) if sheets is not None and (triangles >= 0).all() else None
 
     def of_layers(
         self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None

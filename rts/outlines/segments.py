@@ -37,25 +37,15 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     """
     from rts.outlines import segments_loops as loops
 
-    height, width = breaks.joined.shape[1:]
-    square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, height, width)
+    size = breaks.joined.shape[1:]
+    square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, *size)
     # By squares; in each of them clockwise, part by part if outlines may cross.
     group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
     order = np.argsort(group + 1j * along, kind="stable")  # By both parts, and faster than lexsort.
-    square, ends = square.take(order), ends.take(order, 0)
-    begins = np.append(np.flatnonzero(np.diff(group[order], prepend=-1)), len(square))
-    partner = np.full(len(square), -1, np.int32)
-    loops.join(begins, ends, breaks.place, breaks.tangent, partner)
-    origin, ties, square_sides = loops.segments_of(square, ends, partner, width)
-    around = loops.beyond(ties, len(breaks.place))
+    known = breaks.place, breaks.tangent
+    origin, ties, square_sides, around = loops.segments_of(order, group, square, ends, *known, size[1])
+    triangle = loops.ending(breaks.near, breaks.parts, breaks.triangles)
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
-    ending = np.arange(len(breaks.near)), np.where(breaks.near == 1, 1, 0)
-    triangle, part = breaks.triangles[ending].astype(np.int64), breaks.parts[ending]
-    triangle = np.where(
-        triangle >= 0, triangle + part * (1 + triangle.max(initial=0)), -1
-    )  # Of all parts, no two alike.
-    of_breaks = breaks.place, breaks.tangent, triangle
-    parallel(
-        loops.corners, len(ties), origin, ties, square_sides, around, *of_breaks, corner, pull, work=300 * len(ties)
-    )
+    filled = origin, ties, square_sides, around, *known, triangle, corner, pull
+    parallel(loops.corners, len(ties), *filled, work=300 * len(ties))
     return Segments(origin, ties, square_sides, np.ascontiguousarray(around[:, 1:3]), corner, pull)

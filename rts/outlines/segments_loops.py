@@ -60,8 +60,8 @@ def ends_of(gap, place, near, parts, height, width):
     return square[:count], along[:count], ends[:count]
 
 
-@loop
-def join(begins, ends, place, tangent, partner):
+@compiled
+def _join(begins, ends, place, tangent, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts cross,
@@ -138,26 +138,66 @@ def _read(first, n, step, partner):
 
 
 @loop
-def segments_of(square, ends, partner, width):
-    """First corners (S, 2), ties (S, 2) and sides (S, 2) of segments, int32; see `rts.contracts.records.Outlines`."""
-    origin = np.empty((len(ends), 2), np.int32)
-    ties, square_sides = np.full((len(ends), 2), -1, np.int32), np.full((len(ends), 2), -1, np.int32)
-    count = 0
-    for e in range(len(ends)):
-        other, sign = partner[e], ends[e, 2]
+def segments_of(order, group, square, ends, place, tangent, width):
+    """The segments between ends, those of a square after those of the one before; see `outlines.segments.Segments`.
+
+    Args:
+        order: (E,) sorts ends by squares; in each clockwise, group by group.
+        group: (E,) int64, only ends of one group are joined, which is in one square.
+        square: (E,), see `ends_of`.
+        ends: (E, 5), see `ends_of`.
+        place: (B, 2) x and y of breaks.
+        tangent: (B, 2), see `_join`.
+        width: number of centres in a line.
+
+    Returns:
+        First corners (S, 2) of squares, ties (S, 2) and sides (S, 2), int32; and `_beyond` of these.
+    """
+    count = len(order)
+    begins, several, sorted_ends = np.empty(count + 1, np.int64), 0, np.empty((count, 5), np.int32)
+    for e in range(count):
+        if e == 0 or group[order[e]] != group[order[e - 1]]:
+            begins[several] = e
+            several += 1
+        for i in range(5):
+            sorted_ends[e, i] = ends[order[e], i]
+    begins[several] = count
+    partner = np.full(count, -1, np.int32)
+    _join(begins[: several + 1], sorted_ends, place, tangent, partner)
+    origin = np.empty((count, 2), np.int32)
+    ties, square_sides = np.full((count, 2), -1, np.int32), np.full((count, 2), -1, np.int32)
+    found = 0
+    for e in range(count):
+        other, sign = partner[e], sorted_ends[e, 2]
         # Of two ends the one that leaves the front comes first; of two that cross, the earlier.
-        if other >= 0 and not (sign > 0 or (sign == 0 and (ends[other, 2] < 0 or (ends[other, 2] == 0 and e < other)))):
-            continue
-        origin[count, 0], origin[count, 1] = square[e] // width, square[e] % width
-        ties[count, 0], square_sides[count, 0] = ends[e, 0], ends[e, 1]
         if other >= 0:
-            ties[count, 1], square_sides[count, 1] = ends[other, 0], ends[other, 1]
-        count += 1
-    return origin[:count], ties[:count], square_sides[:count]
+            back = sorted_ends[other, 2]
+            if not (sign > 0 or (sign == 0 and (back < 0 or (back == 0 and e < other)))):
+                continue
+        origin[found, 0], origin[found, 1] = square[order[e]] // width, square[order[e]] % width
+        ties[found, 0], square_sides[found, 0] = sorted_ends[e, 0], sorted_ends[e, 1]
+        if other >= 0:
+            ties[found, 1], square_sides[found, 1] = sorted_ends[other, 0], sorted_ends[other, 1]
+        found += 1
+    ties = ties[:found]
+    return origin[:found], ties, square_sides[:found], _beyond(ties, len(place))
 
 
 @loop
-def beyond(ties, count):
+def ending(near, parts, triangles):
+    """(B,) int64: the triangle that ends at each break, of all parts no two alike, or −1."""
+    most, found = np.int64(-1), np.empty(len(near), np.int64)
+    for b in range(len(near)):
+        most = max(most, np.int64(triangles[b, 1 if near[b] == 1 else 0]))
+    for b in range(len(near)):
+        side = 1 if near[b] == 1 else 0
+        t = triangles[b, side]
+        found[b] = t + parts[b, side] * (1 + most) if t >= 0 else -1
+    return found
+
+
+@compiled
+def _beyond(ties, count):
     """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
 
     `ties` (S, 2) are the ends of segments, between `count` breaks; each break ends at most two.

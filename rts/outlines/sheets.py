@@ -83,10 +83,6 @@ class Sheets(NamedTuple):
         planes, keep = near_and_far(camera), camera.kept_sign(cull)
         return cls(first, starts, vertices, faces, beyond, rows, planes, keep, seen, sides)
 
-    def holds(self, parts: np.ndarray) -> np.ndarray:
-        """True for those of `parts` that the sheets are of."""
-        return (parts >= self.parts.start) & (parts < self.parts.stop)
-
     def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.
 
@@ -129,25 +125,32 @@ class Sheets(NamedTuple):
         part = np.searchsorted(self.starts[1:-1], names[:, 1], side="right") + self.first
         return names, spans, part.astype(np.int32)
 
-    def at(self, triangle: np.ndarray, points: np.ndarray) -> tuple[Fragments, np.ndarray]:
-        """Fragments (1, 1, M) of triangles (M,) at points (M, 2); slopes (M, 2) of depth along x and y, a cell."""
+    def at(self, triangle: np.ndarray, points: np.ndarray) -> Fragments:
+        """Fragments (1, 1, M) of triangles (M,) at points (M, 2)."""
         from rts.outlines import sheets_loops
 
         count = len(triangle)
-        weights, depth, slopes = np.empty((count, 2)), np.empty(count), np.empty((count, 2))
-        arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth, slopes
+        weights, depth = np.empty((count, 2), np.float32), np.empty(count, np.float32)
+        arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth
         parallel(sheets_loops.on_planes, count, *arguments, work=100 * count)
-        weights, depth = weights.astype(np.float32), depth.astype(np.float32)
-        return Fragments(triangle[None, None], weights[None, None], depth[None, None]), slopes
+        return Fragments(triangle[None, None], weights[None, None], depth[None, None])
 
-    def along(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Directions (M, 2), in the image, of the edges of triangles (M,) that are nearest to points (M, 2)."""
+    def edges(
+        self,
+        near: np.ndarray,
+        parts: np.ndarray,
+        triangles: np.ndarray,
+        points: np.ndarray,
+        slope: np.ndarray,
+        depth: np.ndarray,
+        tangent: np.ndarray,
+    ) -> None:
+        """Fill in what the triangles tell of the edges at breaks; see `silhouettes_loops.edges`."""
         from rts.outlines import silhouettes_loops
 
-        found = np.empty((len(triangle), 2))
-        arguments = triangle, points, self.rows, self.vertices, self.faces, found
-        parallel(silhouettes_loops.along, len(found), *arguments, work=100 * len(found))
-        return found
+        own, mesh = (np.int32(self.parts.start), np.int32(self.parts.stop)), (self.rows, self.vertices, self.faces)
+        arguments = near, parts, triangles, points, own, *mesh, slope, depth, tangent
+        parallel(silhouettes_loops.edges, len(near), *arguments, work=100 * len(near))
 
 
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}

@@ -15,7 +15,7 @@ STEPS = 4096
 
 
 @compiled
-def _depth(corners, sign, x, y):
+def plane_at(corners, sign, x, y):
     """Depth of a triangle's plane at a position, and its slopes along x and y, a pixel."""
     total, total_x, total_y, deep, deep_x, deep_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
@@ -176,21 +176,21 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
                 if end >= 0 and end != s and _touch(faces, end, s):
                     # Rounding may tell neighbours apart; sheets that pass through one another share no corner.
                     sign, there = corners_of(end, rows, vertices, faces, corners), depth[y + dy, x + dx]
-                    z = _depth(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
+                    z = plane_at(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
                     joined[axis, y, x] = abs(z - there) <= 1e-5 * abs(there)
 
 
 @loop
-def on_planes(first, last, triangles, points, rows, vertices, faces, weights, depths, slopes):
-    """Triangles' planes at points (M, 2): the first two barycentrics, depths, and their slopes along x and y.
+def on_planes(first, last, triangles, points, rows, vertices, faces, weights, depths):
+    """Triangles' planes at points (M, 2): the first two barycentrics, and depths.
 
-    Of a triangle that is seen edge-on, these are of its nearest edge, and slopes are NaN.
+    Of a triangle that is seen edge-on, these are of its nearest edge.
     """
     corners = np.empty((3, 4))
     for m in range(first, last):
         sign = corners_of(triangles[m], rows, vertices, faces, corners)
         _, weights[m, 0], weights[m, 1] = weights_at(corners, sign, points[m, 0], points[m, 1])
-        depths[m], slopes[m, 0], slopes[m, 1] = _depth(corners, sign, points[m, 0], points[m, 1])
+        depths[m] = plane_at(corners, sign, points[m, 0], points[m, 1])[0]
         if sign == 0:
             depths[m], weights[m, 0], weights[m, 1] = _on_edges(corners, points[m, 0], points[m, 1])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.outlines.sheets_loops import plane_at
 from rts.sampling.points_loops import corners_of, edge
 
 SLACK = 0.01
@@ -155,15 +156,71 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
 
 
 @loop
-def along(first, last, triangles, points, rows, vertices, faces, found):
-    """Fill `found` (M, 2): the direction in the image of the edge of a triangle that is nearest to a point (M, 2)."""
+def edges(first, last, near, parts, triangles, points, own, rows, vertices, faces, slope, depth, tangent):
+    """What the triangles of some parts tell of breaks.
+
+    Args:
+        first: the first break.
+        last: the break after the last.
+        near: (B,), 2 where surfaces cross, 1 where the one behind a break ends there, else 0.
+        parts: (B, 2), the parts before and behind.
+        triangles: (B, 2 or more), alike.
+        points: (B, 2), where breaks are.
+        own: the first of the parts, and the one after the last.
+        rows: (4, 4), see `corners_of`.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3) of the proxy.
+        slope: (B, 2, 2) to fill where surfaces cross: slopes of depth along x and y, a cell.
+        depth: (B,) to fill where surfaces cross.
+        tangent: (B, 2) to fill: along the nearest edge of the triangle that ends, or of the one before.
+    """
     corners = np.empty((3, 4))
-    for m in range(first, last):
-        sign, least = corners_of(triangles[m], rows, vertices, faces, corners), np.inf
-        found[m] = 0.0
-        for k in range(3):
-            ex, ey, e = edge(corners, k, sign)
-            size = np.hypot(ex, ey)
-            if size > 0 and abs(ex * points[m, 0] + ey * points[m, 1] + e) < least * size:
-                least = abs(ex * points[m, 0] + ey * points[m, 1] + e) / size
-                found[m, 0], found[m, 1] = ey, -ex
+    for b in range(first, last):
+        x, y = points[b, 0], points[b, 1]
+        for side in range(2):
+            ends = side == (1 if near[b] == 1 else 0)
+            if not (own[0] <= parts[b, side] < own[1] and (ends or near[b] == 2)):
+                continue
+            sign = corners_of(triangles[b, side], rows, vertices, faces, corners)
+            if near[b] == 2:
+                # Not a number where a triangle is seen edge-on.
+                depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
+            if ends:
+                tangent[b, 0], tangent[b, 1] = _nearest_edge(corners, sign, x, y)
+
+
+@compiled
+def _nearest_edge(corners, sign, x, y):
+    """The direction in the image of the edge of a triangle that is nearest to a position."""
+    least, along, down = np.inf, 0.0, 0.0
+    for k in range(3):
+        ex, ey, e = edge(corners, k, sign)
+        size = np.hypot(ex, ey)
+        if size > 0 and abs(ex * x + ey * y + e) < least * size:
+            least, along, down = abs(ex * x + ey * y + e) / size, ey, -ex
+    return along, down
+
+
+@loop
+def settle(width, depth, near, slope, tangent):
+    """Make tangents (B, 2) unit directions, of crossings the lines where planes meet; those that are flat end before.
+
+    Args:
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+        depth: (B,), see `edges`.
+        near: (B,), see `edges`; becomes 0 where slopes of surfaces that cross hardly differ.
+        slope: (B, 2, 2), see `edges`; becomes 0 but at crossings.
+        tangent: (B, 2), see `edges`.
+    """
+    for b in range(len(near)):
+        if near[b] == 2:
+            x, y = slope[b, 1, 0] - slope[b, 0, 0], slope[b, 1, 1] - slope[b, 0, 1]
+            if abs(x) + abs(y) > 1e-4 * (width[0] + width[1] * depth[b]):
+                tangent[b, 0], tangent[b, 1] = y, -x
+            else:
+                near[b] = 0
+        if near[b] < 2:
+            slope[b] = 0.0
+        length = np.hypot(tangent[b, 0], tangent[b, 1])
+        if length > 0:
+            tangent[b, 0], tangent[b, 1] = tangent[b, 0] / length, tangent[b, 1] / length

@@ -44,14 +44,19 @@ def wanted(first, last, part, joined, met, gaps):
     Then set `joined`, where it was True if a sheet joins both centres: one part is seen at both.
     """
     height, width = part.shape
-    for y in range(first, last):
-        for x in range(width):
-            seen = part[y, x] >= 0
-            across = x + 1 < width and (seen or part[y, x + 1] >= 0) and not joined[0, y, x]
-            below = y + 1 < height and (seen or part[y + 1, x] >= 0) and not joined[1, y, x]
-            gaps[0, y, x], gaps[1, y, x] = across or met[0, y, x] == 2, below or met[1, y, x] == 2
-            joined[0, y, x] = seen and x + 1 < width and part[y, x + 1] == part[y, x]
-            joined[1, y, x] = seen and y + 1 < height and part[y + 1, x] == part[y, x]
+    for axis in range(2):
+        for y in range(first, last):
+            # Without branches, for loops that take several cells at once.
+            across, below = 1 - axis, axis if y + 1 < height else 0
+            count = width - across if y + axis < height else 0
+            for x in range(count):
+                one, other = part[y, x], part[y + below, x + across]
+                apart = (one & other) >= 0 and not joined[axis, y, x]  # −1 if nothing is seen at both.
+                gaps[axis, y, x] = apart | (met[axis, y, x] == 2)
+                joined[axis, y, x] = (one >= 0) & (one == other)
+            for x in range(count, width):
+                gaps[axis, y, x] = met[axis, y, x] == 2
+                joined[axis, y, x] = False
 
 
 @loop
@@ -459,7 +464,10 @@ def _kind(before, behind, one_triangle, nearer, seamless, stops, starts):
 
 
 @loop
-def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, rows, counts, whole, numbers):
+def breaks(
+    first, last, gap, begins, spans, names, parts, seen, triangle, depth, ends, end_depth, inner, rows, counts, whole,
+    numbers,
+):
     """Fill in the breaks along gaps, in order.
 
     The helpers take these arrays whole, with a gap's number and range of spans: a view of an array costs as much as a
@@ -468,12 +476,16 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, row
     Args:
         first: the first gap.
         last: the gap after the last.
+        gap: (M, 3), see `Gaps`.
         begins: (M + 1,) where the spans of each gap begin.
         spans: (N, 6), see `spans_of`.
         names: (N, 2) gap and triangle.
         parts: (N,) int32.
-        ends: (M, 2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
-        end_depth: (M, 2) their depths.
+        seen: (H, W) int32, the parts seen at centres, or −1.
+        triangle: (H, W) int32, and their triangles.
+        depth: (H, W) float64.
+        ends: (M, 2, 2) int32 to fill: part and triangle of the samples at both centres; −1 where nothing is seen.
+        end_depth: (M, 2) to fill: their depths.
         inner: distance of the samples that tell colours.
         rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
         counts: (M,) to fill: the number of breaks of each gap.
@@ -487,6 +499,9 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, row
     pieces, starts, at = np.empty(most, np.int64), np.empty(most), 2 * begins[first] + 4 * first
     for g in range(first, last):
         begin, stop = begins[g], begins[g + 1]
+        for k in range(2):
+            y, x = gap[g, 0] + k * (1 - gap[g, 2]), gap[g, 1] + k * gap[g, 2]
+            ends[g, k, 0], ends[g, k, 1], end_depth[g, k] = seen[y, x], triangle[y, x], depth[y, x]
         n = _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts)
         rows[g], count, a = at, 0, 0
         for m in range(1, n):
@@ -520,6 +535,37 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, row
         _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers)
         counts[g] = count
         at += count
+
+
+@loop
+def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, triangles, ends):
+    """Fill in the fields of `Breaks`, gap after gap, from what `breaks` found with room to spare.
+
+    Args:
+        rows: (M,), see `breaks`.
+        counts: (M,), see `breaks`.
+        gap_of: (M, 3), see `Gaps`.
+        whole: see `breaks`.
+        numbers: see `breaks`.
+        gap: (B, 3) int32 to fill.
+        points: (B, 5, 2) to fill: x and y of the break, of its last samples, and of those that tell colours.
+        parts: (B, 2) int32 to fill.
+        near: (B,) int32 to fill.
+        triangles: (B, 4) int32 to fill; −1 where nothing is seen.
+        ends: (B, 2) bool to fill.
+    """
+    b = 0
+    for g in range(len(rows)):
+        y, x, row = gap_of[g, 0], gap_of[g, 1], gap_of[g, 2]
+        for n in range(rows[g], rows[g] + counts[g]):
+            gap[b, 0], gap[b, 1], gap[b, 2], near[b] = y, x, row, whole[n, 1]
+            for i in range(5):
+                points[b, i, 0], points[b, i, 1] = x + 0.5 + numbers[n, i] * row, y + 0.5 + numbers[n, i] * (1 - row)
+            for side in range(2):
+                parts[b, side], ends[b, side] = whole[n, 2 + side], whole[n, 8 + side] == 1
+                for i in range(side, 4, 2):
+                    triangles[b, i] = whole[n, 4 + i] if whole[n, 2 + side] >= 0 else -1
+            b += 1
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from rts.compiling.threads import parallel
 from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks
 from rts.outlines.sheets import Sheets
-from rts.outlines.spans import crossings, spans_on, tangents
+from rts.outlines.spans import moving_edges, spans_on
 
 
 def breaks_of_stacks(
@@ -29,7 +29,7 @@ def breaks_of_stacks(
     """
     gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
     whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets)
-    gap, near = gaps.gap[whole[:, 0]], whole[:, 1]
+    gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
     joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
     inside, part = layers.part[0] >= 0, layers.part
     joined[0, :, :-1] = inside[:, 1:] & (part[:, :, 1:] == part[:, :, :-1]).all(0)
@@ -37,8 +37,7 @@ def breaks_of_stacks(
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
     at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
-    near, slope = crossings(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
-    tangent = tangents(near, slope, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
+    slope, tangent = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
     ends, last_points = whole[:, 4:] == 1, points[:, :2]
@@ -66,7 +65,7 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
         for sheet in sheets:
             sheet.join(front, met, joined)
-        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=2 * front.part.size)
+        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=front.part.size)
         marks = marks | wanted
     return np.asarray(marks)
 
