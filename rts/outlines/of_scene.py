@@ -70,9 +70,13 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
-    rows, owners = found.rows, xp.reshape(xp.clip(found.parts, 0), (-1,))
-    moved = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
-    rows = xp.where(rows >= 0, rows + xp.reshape(moved, rows.shape), rows)
+    rows = found.rows
+    behind: Any = moved[0]
+    if len(moved) > 1:
+        owners = xp.reshape(xp.clip(found.parts, 0), (-1,))
+        behind = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
+        behind = xp.reshape(behind, rows.shape)
+    rows = xp.where(rows >= 0, rows + behind, rows)
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -106,7 +110,7 @@ def _found_on_host(
         of_parts, whole, camera, cells = known
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
-        here = scene._replace(parts=parts, camera=whole)
+        here = scene._replace(parts=parts, camera=whole, context=Context(engine_of(), None))
         return here, Grid(camera, grid.size), at_centres(cells, sampled.samples), [x for *_, x in of_parts]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
@@ -120,8 +124,7 @@ def _found_on_host(
 
     def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]] | None:
         known = [entered(arrays) for arrays in items]
-        scenes = [own._replace(context=Context(engine_of(), None)) for own, *_ in known]
-        _, grids, centres, of_proxies = zip(*known, strict=True)
+        scenes, grids, centres, of_proxies = zip(*known, strict=True)
         batch = found_in_batch(scenes, grids, centres, of_proxies, most)
         if batch is None:
             return None

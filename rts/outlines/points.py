@@ -25,6 +25,7 @@ from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.sampling.entries import entry_of, host_value, on_host
 from rts.sampling.joint import Joint
+from rts.sampling.packing import pack_fragments
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -228,14 +229,18 @@ class Points:
         layers: int = 1,
     ) -> Samples:
         """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
-        sampler, camera, entry, sheets = self._parts[part]
-        if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
+        (sampler, camera, entry, sheets), checked = self._parts[part], self._scene.parts[part]
+        plain = sheets is not None and not _refines(checked) and checked.surface.centered
+        if fragments is not None and plain and not self._scene.context.engine.differentiates:
+            # What the sampler's call to the host comes to.
+            return pack_fragments(fragments, entry.proxy).replace(gbuffer_names=checked.reads, at_points=True)
+        if not len(points) and (sheets is None or _refines(checked)):
             # Surfaces may want a ray at least; nothing names its sample.
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:
             sampler = _OnTriangles(fragments)
         request = Request(points=points, pairs=pairs, entry=entry)
-        samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, layers, request)
+        samples = sampler.sample(checked, camera, self._grid.size, layers, request)
         if samples.at_points:
             return samples
         warn(
@@ -273,8 +278,11 @@ class Points:
 
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
-    owners = np.repeat(np.arange(len(samples), dtype=np.int32), [one.ids.shape[-2] for one in samples])
-    part = np.append(owners, np.int32(-1)).take(cells.row)
+    if len(samples) == 1:
+        part = np.minimum(cells.row, np.int32(0))
+    else:
+        owners = np.repeat(np.arange(len(samples), dtype=np.int32), [one.ids.shape[-2] for one in samples])
+        part = np.append(owners, np.int32(-1)).take(cells.row)
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
     return Fronts(part, triangle, cells.depth.astype(np.float64))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.trees import Tree
-from rts.contracts.records import ArraySpec, Fragments, Samples
+from rts.contracts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
 from rts.sampling.host_call import SampleBounds
@@ -57,9 +57,7 @@ class TriangleSearch:
         ids, capacity = fragments.triangle_ids, self.bounds.capacity
         if not self.surface.refines:
             if uniform:
-                return _of_one_row(
-                    pack_fragments(fragments, entry.proxy, capacity, _first_of(covered)), covered, fragments
-                )
+                return _of_one_row(fragments, covered, entry.proxy, capacity)
             packed = pack_fragments(fragments, entry.proxy, capacity, covered)
             return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
         unrefined = pack_fragments(fragments, entry.proxy, None, covered)
@@ -101,17 +99,12 @@ class TriangleSearch:
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
 
 
-def _first_of(covered: np.ndarray) -> np.ndarray:
-    """The mask `covered` with only its first cell; none if there is none."""
-    first = np.zeros_like(covered)
-    at = covered.argmax()
-    first.reshape(-1)[at] = covered.reshape(-1)[at]
-    return first
-
-
-def _of_one_row(samples: Samples, covered: np.ndarray, fragments: Fragments) -> Samples:
-    """Samples of one row, which all covered cells name."""
-    row = covered.view(np.int8).astype(np.int32) - np.int32(1)
+def _of_one_row(fragments: Fragments, covered: np.ndarray, proxy: Proxy, capacity: int | None) -> Samples:
+    """Samples of one row, that of the first covered cell, which all covered cells name."""
+    at = int(covered.argmax())
+    first = Fragments(*(x.reshape(covered.size, 1, 1, *x.shape[3:])[at : at + 1] for x in fragments))
+    samples = pack_fragments(first, proxy, capacity, covered.reshape(-1, 1, 1)[at : at + 1])
+    row = covered.view(np.int8) - np.int32(1)
     return samples.replace(row=row, depth=fragments.depth, triangle=fragments.triangle_ids)
 
 

@@ -31,22 +31,20 @@ def segments_between(gap, place, near):
     parts = np.where(near[:, None] == [0, 1], 0, -1).astype(np.int32)
     square, along, ends = loops.ends_of(gap, place, near, parts, 5, WIDTH)
     order = np.lexsort((along, square))
-    square, ends = square[order], ends[order]
-    begins = np.append(np.flatnonzero(np.diff(square, prepend=-1)), len(square))
-    partner = np.full(len(square), -1, np.int32)
-    loops.join(begins, ends, place, np.zeros((len(place), 2)), partner)
-    return loops.segments_of(square, ends, partner, WIDTH)
+    return loops.segments_of(order, square, square, ends, place, np.zeros((len(place), 2)), WIDTH)
 
 
 @pytest.mark.parametrize("near", [0, 1])
 def test_a_segment_starts_where_the_way_clockwise_leaves_the_front(near):
     """An outline from top to bottom through the square (1, 1); what ends lies on its left, or on its right."""
-    origin, ties, side = segments_between([(1, 1, 1), (2, 1, 1)], [(1.8, 1.5), (1.8, 2.5)], [near, near])
+    _, ties, side, _ = segments_between([(1, 1, 1), (2, 1, 1)], [(1.8, 1.5), (1.8, 2.5)], [near, near])
     across = [tuple(t) for t, s in zip(ties.tolist(), side.tolist(), strict=True) if min(s) >= 0]
     assert across == [(0, 1) if near == 0 else (1, 0)]
 
 
 def test_the_breaks_before_and_after_a_segment_are_in_order():
-    ties = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)], np.int32)
-    expected = [(-1, -1, 2, 3), (-1, 0, 3, 4), (0, 1, 4, 5), (1, 2, 5, -1), (2, 3, -1, -1)]
-    np.testing.assert_array_equal(loops.beyond(ties, 6), expected)
+    """An outline from top to bottom through all rows of centres."""
+    places = [(1.8, y + 0.5) for y in range(5)]
+    _, ties, _, around = segments_between([(y, 1, 1) for y in range(5)], places, [0] * 5)
+    np.testing.assert_array_equal(ties, [(0, 1), (1, 2), (2, 3), (3, 4)])
+    np.testing.assert_array_equal(around, [(-1, -1, 2, 3), (-1, 0, 3, 4), (0, 1, 4, -1), (1, 2, -1, -1)])

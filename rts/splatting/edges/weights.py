@@ -62,17 +62,13 @@ class _Weights(NamedTuple):
         from rts.splatting.edges import weights_loops as loops
 
         count, segments, gap = len(outlines.place), len(outlines.square), outlines.gap
-        shown = np.where((outlines.rows >= 0) & (outlines.inner >= 0), outlines.inner, outlines.rows)
-        step = np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)
-        points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
+        shown, movers, near = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), outlines.near
+        points, origins = np.empty((count, 2, 2)), np.empty((count, 2, 2))
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
         cell_side = np.empty((segments, 4, 2), np.int8)
-        loops.weigh_breaks(outlines.near, outlines.slope, moves)
-        paired = np.flatnonzero(outlines.pair[:, 0] >= 0)
-        movers, origins = np.array(outlines.rows), points.copy()
-        movers[paired], origins[paired] = outlines.pair[paired], points[paired, outlines.near[paired]][:, None]
-        moves[paired] = 0.5 * np.eye(3, 2)
+        of_samples = outlines.rows, outlines.inner, outlines.pair, outlines.points
+        loops.weigh_breaks(gap, near, outlines.slope, *of_samples, shown, points, movers, origins, moves)
         ties = outlines.ties
         geometry = ties, outlines.square_sides, outlines.corner, outlines.pull
         known = outlines.square, *geometry, path, share, cell_side, flux

@@ -14,10 +14,38 @@ from rts.compiling.loops import compiled, loop
 
 
 @loop
-def weigh_breaks(near, slope, moves):
-    """Fill `moves` (B, 2, 3, 2): motion of breaks along x and y, for motions (x, y, depth) of their two samples."""
+def weigh_breaks(gap, near, slope, rows, inner, pair, places, shown, points, movers, origins, moves):
+    """Fill in the weights of breaks; see `rts.contracts.records.Outlines`.
+
+    Args:
+        gap: (B, 3).
+        near: (B,).
+        slope: (B, 2, 2).
+        rows: (B, 2).
+        inner: (B, 2).
+        pair: (B, 2).
+        places: (B, 2), the field `points`.
+        shown: (B, 2) int32 to fill: the samples that tell colours, or −1.
+        points: (B, 2, 2) to fill: x and y of the last samples.
+        movers: (B, 2) int32 to fill: the samples that breaks move with, or −1: the last ones, or a pair.
+        origins: (B, 2, 2) to fill: x and y of these.
+        moves: (B, 2, 3, 2) to fill: motion of breaks along x and y, for motions (x, y, depth) of their two samples.
+    """
     for b in range(len(near)):
+        paired = pair[b, 0] >= 0
+        for i in range(2):
+            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
+            movers[b, i] = pair[b, i] if paired else rows[b, i]
+            points[b, i, 0] = gap[b, 1] + 0.5 + places[b, i] * gap[b, 2]
+            points[b, i, 1] = gap[b, 0] + 0.5 + places[b, i] * (1 - gap[b, 2])
+        for i in range(2):
+            of = near[b] if paired else i
+            origins[b, i, 0], origins[b, i, 1] = points[b, of, 0], points[b, of, 1]
         moves[b] = 0.0
+        if paired:
+            for i in range(2):
+                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
+            continue
         if near[b] < 2:
             moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
             continue
