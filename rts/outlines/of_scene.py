@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.engines import Context, engine_of, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
@@ -20,7 +20,8 @@ from rts.outlines.found import Found, columns
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_batch import found_in_batch
 from rts.outlines.points import Points, at_centres, found_in_views
-from rts.sampling.entries import host_value, is_batched, proxy_inputs
+from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
+from rts.sampling.host_scenes import real_of
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -42,22 +43,23 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     Warns:
         InputWarning: a sampler cannot sample single points.
     """
-    cells, known = sampled.cells, []
+    cells, inputs = sampled.cells, None
     if all(scene.opaque):
         sampled = replace(sampled, cells=cells.first(1))
-    for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
+    if scene.context.engine.differentiates:
         # Functions of surfaces want the arrays that they are given.
-        known.append((part.transform, read, proxy_inputs(part) if entry is None else None))
-    inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
+        known = [
+            (part.transform, read, proxy_inputs(part) if entry is None else None)
+            for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True)
+        ]
+        inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
-    on_sheets = not scene.joints and all(map(has_sheets, scene.parts, scene.samplers))
-    if traced or on_sheets or any(map(is_batched, leaves(inputs))):
+    if traced or any(map(is_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
-        entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
-        centres = at_centres(map_leaves(host_value, inputs[3]), sampled.samples)
-        (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
+        centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
+        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene))], [centres])
         specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
@@ -157,12 +159,6 @@ def _found_on_host(
 def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
     """True if several threads may sample points of a part at once."""
     return has_sheets(part, sampler) and isinstance(sampler, TriangleSampler) and sampler.draws_at_once
-
-
-def real_of(scene: Scene) -> Any:
-    """The dtype of a scene's floating arrays."""
-    like = scene.context.like
-    return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
 
 
 def _rooms(part: CheckedPart, samples: Samples, rows: int, capacity: int | None) -> dict[str, int]:

@@ -12,7 +12,7 @@ from rts.contracts.records import Request, Sampled
 from rts.outlines.of_scene import with_outlines
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
-from rts.sampling.entries import with_entries
+from rts.sampling.host_scenes import in_engine, on_the_host
 from rts.sampling.joint import with_joints
 from rts.sampling.layer_count import with_all_layers
 from rts.sampling.merging import merge
@@ -84,8 +84,10 @@ def sampled_scene(
     height, width = factor * size[0], factor * size[1]
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
-    scene = with_entries(scene, grid) if outlines else scene
-    scene = with_joints(scene, grid) if joins and capacity is None and not settings.fronts else scene
+    given, host = scene, on_the_host(scene, grid)
+    if host is not None:
+        scene, grid = host
+        scene = with_joints(scene, grid) if joins and capacity is None and not settings.fronts else scene
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
     uniform = uniform and not settings.fronts
@@ -95,7 +97,8 @@ def sampled_scene(
     if outlines:
         triangle = sampled.triangle if settings.fronts else None
         sampled = with_outlines(sampled, scene, grid, capacity).replace(triangle=triangle)
-    return replace(sampled, supersample=factor, apron=settings.apron)
+    sampled = replace(sampled, supersample=factor, apron=settings.apron)
+    return sampled if host is None else in_engine(sampled, given)
 
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:

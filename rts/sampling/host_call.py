@@ -97,9 +97,11 @@ class HostCall:
         self._transform = [] if part.transform is None else [part.transform]
         self._engine, like = context_of(part.theta, cameras)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
-        theta = {name: part.theta[name] for name in surface.reads(part.theta)}
-        # A surface without derivatives is evaluated where it is sampled, on the host.
-        self._theta = theta if self._engine.differentiates and is_constant(theta) else None
+        self._theta = None
+        if self._engine.differentiates:
+            # A surface without derivatives is evaluated where it is sampled, on the host.
+            theta = {name: part.theta[name] for name in surface.reads(part.theta)}
+            self._theta = theta if is_constant(theta) else None
         self._reads = part.reads if isinstance(part, CheckedPart) else None
         self._attributes = _attribute_specs(surface, self._reads, self._theta, bounds, like)
 

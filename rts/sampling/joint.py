@@ -12,14 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rts.arrays.engines import floating_bits, is_constant
-from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, Sampled, Samples
+from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
 from rts.sampling.camera_checks import check_camera
-from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
 from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -117,39 +114,20 @@ class Joint:
         )
         ends = np.cumsum(np.maximum(counts, 1))[:-1]
         tables = zip(*(np.split(x, ends) for x in sorted_rows), counts > 0, strict=True)
-        context = self.scene.context
-        real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
-        arrays: list[np.ndarray] = [row, packed.depth, ids, packed.overflow]
-        names = []
+        samples = []
         for part, (ids_of_part, params, seen) in zip(self.parts, tables, strict=True):
             used = np.arange(len(ids_of_part), dtype=np.int32)[None, None] - np.int32(not seen)
-            known = _evaluated(part, ids_of_part, params, context.engine.differentiates)
-            names.append(None if known is None else list(known))
-            arrays += [ids_of_part, params, used, *(np.asarray(x, real) for x in (known or {}).values())]
-        specs = [ArraySpec(x.shape, x.dtype) for x in arrays]
-        like = [] if context.like is None else [context.like]
-        results = iter(context.engine.call_host(lambda *_: arrays, specs, *like))
-        row, depth, triangle, overflow = (next(results) for _ in range(4))
-        samples = []
-        for part, known in zip(self.parts, names, strict=True):
-            ids_of_part, params, used = next(results), next(results), next(results)
-            gbuffer = None if known is None else {name: next(results) for name in known}
-            cells = Cells(used)
-            samples.append(Samples(ids_of_part, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
-        return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
+            samples.append(Samples(ids_of_part, params, Cells(used), packed.overflow, gbuffer_names=part.reads))
+        return Sampled(tuple(samples), Cells(row, packed.depth, ids), packed.overflow)
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:
-    """The scene with its `joints`, where neighbouring parts can be sampled at once.
+    """A scene on the host with its `joints`, where neighbouring parts can be sampled at once.
 
-    These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`. Engines
-    that pad arrays, and traced values, have none.
+    These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
     """
     suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
-    if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)) or not is_known(scene, grid):
-        return scene
-    like = scene.context.like
-    if like is not None and scene.context.engine.padded(like):
+    if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)):
         return scene
     joints = []
     runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))
@@ -164,13 +142,8 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
     """Joints of some of neighbouring parts: those of few triangles, alike in their tables, and not mirrored."""
     proxies, cameras = {}, {}
     for index in indices:
-        part, entry, sampler = scene.parts[index], scene.entries[index], scene.samplers[index]
-        camera = on_host(grid.camera.within(part.transform).for_size(grid.size))
-        cameras[index] = check_camera(camera, *([] if part.transform is None else [host_value(part.transform)]))
-        if entry is None:
-            assert isinstance(sampler, TriangleSampler)
-            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
-        proxies[index] = entry.proxy
+        proxies[index] = scene.entries[index].proxy
+        cameras[index] = check_camera(grid.camera.within(scene.parts[index].transform))
 
     def kind(index: int) -> tuple:
         proxy, mirrored = proxies[index], np.linalg.det(cameras[index].view[:3, :3]) < 0
@@ -195,13 +168,3 @@ def is_suited(part: CheckedPart, sampler: object) -> bool:
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Vertices (V, 3), moved by a matrix (4, 4), float64."""
     return vertices @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _evaluated(part: CheckedPart, ids: np.ndarray, params: np.ndarray, differentiates: bool) -> dict[str, Array] | None:
-    """The attributes at samples that the shader reads, if θ is constant; see `Samples.gbuffer`."""
-    if not (differentiates and is_constant(part.read)):
-        return None
-    row = np.arange(len(ids), dtype=np.int32)[None, None]
-    gbuffer = part.surface.evaluate(part.read, Samples(ids, params, Cells(row), np.asarray(0, np.int32)))
-    names = list(gbuffer) if part.reads is None else ["position", *(n for n in part.reads if n in gbuffer)]
-    return {name: gbuffer[name] for name in dict.fromkeys(names)}

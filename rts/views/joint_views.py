@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import Context, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Cells, Outlines, Sampled, Samples
 from rts.outlines.of_scene import with_outlines
 from rts.rendering.settings import RenderSettings
+from rts.sampling.host_scenes import in_engine, real_of
 from rts.sampling.picture import Picture
 from rts.sampling.side_by_side import View, joined
 from rts.sampling.tables import in_one_table
@@ -26,7 +27,9 @@ def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSet
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
     sampled = scene.joints[0].sampled(picture.size, settings.most_layers, settings.finds_outlines)
     if settings.finds_outlines:
-        sampled = with_outlines(sampled, scene, grid)
+        here = Context(engine_of(), np.zeros((), real_of(scene)))
+        sampled = with_outlines(sampled, scene._replace(context=here), grid)
+    sampled = in_engine(sampled, scene)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
     return _by_place(sampled, picture, [len(view.proxies) for view in views])
 

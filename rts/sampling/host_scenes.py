@@ -1,0 +1,80 @@
+"""Scenes of known values, sampled on the host whatever their engine; and their samples in arrays of that engine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rts.arrays.engines import Context, engine_of, floating_bits, is_constant
+from rts.arrays.trees import collected, map_leaves
+from rts.contracts.checked_parts import CheckedPart
+from rts.contracts.records import ArraySpec, Sampled, Samples
+from rts.contracts.sampler import Sampler
+from rts.contracts.surface import TriangleSurface
+from rts.plugin_base import overrides
+from rts.sampling.camera_checks import check_camera
+from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
+from rts.sampling.scene import Grid, Scene
+from rts.sampling.triangle_sampler import TriangleSampler
+
+
+def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid] | None:
+    """A scene of triangles on the host: NumPy cameras and transforms, entries for all parts, and no θ.
+
+    None where values are traced, or several at once; where a sampler has a way of its own; and for engines that pad.
+    """
+    like = scene.context.like
+    if like is not None and scene.context.engine.padded(like):
+        return None
+    if not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
+        return None
+    parts, entries, seen = [], [], grid._replace(camera=on_host(grid.camera))
+    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
+        transform = None if part.transform is None else host_value(part.transform)
+        camera = check_camera(seen.camera.within(transform), *([] if transform is None else [transform]))
+        if entry is None:
+            assert isinstance(sampler, TriangleSampler)
+            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
+        parts.append(replace(part, theta={}, transform=transform))
+        entries.append(entry)
+    context = Context(engine_of(), np.zeros((), real_of(scene)))
+    return scene._replace(parts=parts, camera=on_host(scene.camera), entries=entries, context=context), seen
+
+
+def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:
+    """True if a part's triangles are all that its sampler asks of it, and may be drawn once they are made."""
+    if not (isinstance(sampler, TriangleSampler) and isinstance(part.surface, TriangleSurface)):
+        return False
+    return sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
+
+
+def real_of(scene: Scene) -> type:
+    """The dtype of a scene's floating arrays."""
+    like = scene.context.like
+    return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
+
+
+def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
+    """Samples that were found on the host, in arrays of the scene's engine.
+
+    Of parts whose θ is constant they have the attributes that shaders read.
+    """
+    engine, like = scene.context
+    if not engine.differentiates:
+        return sampled
+    samples = [_evaluated(*one, real_of(scene)) for one in zip(scene.parts, sampled.samples, strict=True)]
+    sampled = replace(sampled, samples=tuple(samples))
+    arrays = collected(sampled)
+    specs = [ArraySpec(x.shape, x.dtype) for x in arrays]
+    moved = iter(engine.call_host(lambda *_: arrays, specs, *([] if like is None else [like])))
+    return map_leaves(lambda _: next(moved), sampled)
+
+
+def _evaluated(part: CheckedPart, samples: Samples, real: type) -> Samples:
+    """The samples of a part with the attributes that its shader reads, if its θ is constant; see `Samples.gbuffer`."""
+    if not is_constant(part.read):
+        return samples
+    gbuffer = part.surface.evaluate(part.read, replace(samples, gbuffer_names=None))
+    names = list(gbuffer) if part.reads is None else ["position", *(n for n in part.reads if n in gbuffer)]
+    return replace(samples, gbuffer={name: np.asarray(gbuffer[name], real) for name in dict.fromkeys(names)})
