@@ -181,8 +181,8 @@ LOOPS = [
     Defect(
         "outlines run the wrong way",
         "rts/outlines/segments_loops.py",
-        "if other >= 0 and not (sign > 0 or (sign == 0 and (ends[other, 2] < 0",
-        "if other >= 0 and not (sign < 0 or (sign == 0 and (ends[other, 2] < 0",
+        "if not (sign > 0 or (sign == 0 and (back < 0",
+        "if not (sign < 0 or (sign == 0 and (back < 0",
         "segments edges",
     ),
     Defect(

@@ -49,10 +49,10 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     if scene.context.engine.differentiates:
         # Functions of surfaces want the arrays that they are given.
         known = [
-            (part.transform, read, proxy_inputs(part) if entry is None else None)
-            for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True)
+            (scene.local_camera(index, grid), read, proxy_inputs(scene.parts[index]) if entry is None else None)
+            for index, (read, entry) in enumerate(zip(scene.read, scene.entries, strict=True))
         ]
-        inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
+        inputs = stopped((known, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
@@ -109,10 +109,11 @@ def _found_on_host(
         """Scene, cells, what is seen at their centres, and the inputs of proxies, on the host."""
         values = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), inputs)
-        of_parts, whole, camera, cells = known
-        own_parts = zip(scene.parts, of_parts, strict=True)
-        parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
-        here = scene._replace(parts=parts, camera=whole, context=Context(engine_of(), None))
+        of_parts, camera, cells = known
+        pairs = zip(scene.parts, of_parts, strict=True)
+        parts = [replace(part, theta=theta, transform=None) for part, (_, theta, _) in pairs]
+        cameras = [seen for seen, *_ in of_parts]
+        here = scene._replace(parts=parts, cameras=cameras, context=Context(engine_of(), None))
         return here, Grid(camera, grid.size), at_centres(cells, sampled.samples), [x for *_, x in of_parts]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:

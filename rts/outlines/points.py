@@ -107,7 +107,7 @@ class Points:
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
-            camera, sheets, joint = grid.camera.within(part.transform), None, joints.get(index)
+            camera, sheets, joint = scene.local_camera(index, grid), None, joints.get(index)
             if joint is not None:
                 sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies)
             elif parts and parts[-1][3] is not None and index in parts[-1][3].parts:

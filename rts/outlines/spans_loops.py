@@ -465,7 +465,22 @@ def _kind(before, behind, one_triangle, nearer, seamless, stops, starts):
 
 @loop
 def breaks(
-    first, last, gap, begins, spans, names, parts, seen, triangle, depth, ends, end_depth, inner, rows, counts, whole,
+    first,
+    last,
+    gap,
+    begins,
+    spans,
+    names,
+    parts,
+    seen,
+    triangle,
+    depth,
+    ends,
+    end_depth,
+    inner,
+    rows,
+    counts,
+    whole,
     numbers,
 ):
     """Fill in the breaks along gaps, in order.

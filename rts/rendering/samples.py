@@ -111,9 +111,8 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
             number = joint.stop
             continue
         part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
-        sampled = sampler.sample(
-            part, grid.camera.within(part.transform), grid.size, count, replace(request, entry=entry)
-        )
+        camera = scene.local_camera(number, grid)
+        sampled = sampler.sample(part, camera, grid.size, count, replace(request, entry=entry))
         tables.append(check_samples(sampled, grid.size, sampler))
         number += 1
     return merge(tables, count)

@@ -20,7 +20,7 @@ from rts.sampling.triangle_sampler import TriangleSampler
 
 
 def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid] | None:
-    """A scene of triangles on the host: NumPy cameras and transforms, entries for all parts, and no θ.
+    """A scene of triangles on the host, and its cells: entries and cameras of all parts, in place of θ and transforms.
 
     None where values are traced, or several at once; where a sampler has a way of its own; and for engines that pad.
     """
@@ -29,24 +29,27 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid] | None:
         return None
     if not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
         return None
-    parts, entries, seen = [], [], grid._replace(camera=on_host(grid.camera))
-    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
-        transform = None if part.transform is None else host_value(part.transform)
-        camera = check_camera(seen.camera.within(transform), *([] if transform is None else [transform]))
+    parts, entries, cameras = [], [], []
+    for index, (part, sampler, entry) in enumerate(zip(scene.parts, scene.samplers, scene.entries, strict=True)):
+        # The product that later projects the samples, to the bit.
+        blamed = [] if part.transform is None else [host_value(part.transform)]
+        camera = check_camera(on_host(scene.local_camera(index, grid)), *blamed)
         if entry is None:
             assert isinstance(sampler, TriangleSampler)
             entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
-        parts.append(replace(part, theta={}, transform=transform))
+        parts.append(replace(part, theta={}, transform=None))
         entries.append(entry)
+        cameras.append(camera)
     context = Context(engine_of(), np.zeros((), real_of(scene)))
-    return scene._replace(parts=parts, camera=on_host(scene.camera), entries=entries, context=context), seen
+    here = scene._replace(parts=parts, entries=entries, cameras=cameras, context=context)
+    return here, grid._replace(camera=on_host(grid.camera))
 
 
 def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:
-    """True if a part's triangles are all that its sampler asks of it, and may be drawn once they are made."""
+    """True if a part's triangles are all that its sampler asks of it, and stay as they are made."""
     if not (isinstance(sampler, TriangleSampler) and isinstance(part.surface, TriangleSurface)):
         return False
-    return sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
+    return not any(overrides(sampler, name, TriangleSampler) for name in ("sample", "update"))
 
 
 def real_of(scene: Scene) -> type:

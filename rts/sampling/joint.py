@@ -16,7 +16,6 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.sampling.camera_checks import check_camera
 from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -143,7 +142,7 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
     proxies, cameras = {}, {}
     for index in indices:
         proxies[index] = scene.entries[index].proxy
-        cameras[index] = check_camera(grid.camera.within(scene.parts[index].transform))
+        cameras[index] = scene.local_camera(index, grid)
 
     def kind(index: int) -> tuple:
         proxy, mirrored = proxies[index], np.linalg.det(cameras[index].view[:3, :3]) < 0

@@ -28,6 +28,7 @@ class Scene(NamedTuple):
         samplers: the sampler of each part.
         entries: the structure that each sampler has built for its part, or None.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
+        cameras: the camera of the grid in the local space of each part, where it is known already.
         joints: neighbouring parts that are sampled at once; see `rts.sampling.joint`.
     """
 
@@ -36,6 +37,7 @@ class Scene(NamedTuple):
     samplers: Sequence[Sampler]
     entries: Sequence[Any]
     context: Context
+    cameras: Sequence[Camera] = ()
     joints: Sequence[Any] = ()
 
     @property
@@ -76,6 +78,10 @@ class Scene(NamedTuple):
         """The scene with its camera made for images of a size; an AspectWarning if the camera is for another ratio."""
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
+
+    def local_camera(self, part: int, grid: Grid) -> Camera:
+        """The camera of a grid in the local space of a part."""
+        return self.cameras[part] if self.cameras else grid.camera.within(self.parts[part].transform)
 
     def context_with(self, *others: Tree) -> Context:
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""

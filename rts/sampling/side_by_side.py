@@ -68,7 +68,7 @@ class View(NamedTuple):
         proxies, seen, mirrored = [], [], False
         sign = Camera(np.eye(4), p).kept_sign(cull)
         for index, (part, entry) in enumerate(zip(scene.parts, scene.entries, strict=True)):
-            local = on_host(grid.camera.within(part.transform).for_size(grid.size))
+            local = on_host(scene.local_camera(index, grid).for_size(grid.size))
             local = check_camera(local, *([] if part.transform is None else [host_value(part.transform)]))
             if entry is None:
                 arrays = map_leaves(host_value, proxy_inputs(part)) if inputs is None else inputs[index]
