@@ -13,12 +13,14 @@ from collections.abc import Callable
 from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.combine import combine
-from rts.operations.depth_limits import BIAS, FAR, OWN
+from rts.operations.depth_limits import BIAS, FAR, OWN, REACH
 from rts.operations.operation import Operation
 
 
-def coverage(cells: Array, points: Array, planes: Array) -> Array:
+def coverage(cells: Array, points: Array, planes: Array, lens: Array) -> Array:
     """The covered share of points (N, 1), 0 to 1, differentiable in cells and points, to first order.
+
+    Points beside the picture or before the near plane are not covered.
 
     A cell is in front of a point if its plane is, and if it is in front of the plane of the point's own surface, where
     some cell around shows that. So neither slopes nor edges of solids shade themselves, if they are two cells wide:
@@ -27,10 +29,23 @@ def coverage(cells: Array, points: Array, planes: Array) -> Array:
     Args:
         cells: (H · W, 2) x and y of the sample in each cell, of which only derivatives count; with alpha, if the
             samples are not opaque, (H · W, 3).
-        points: (N, 3) x, y, and depth. Depth is of a kind that grows evenly on planes; it has no derivative.
-        planes: (H, W, 8) of the sample in each cell, see `depth_planes`. At least 4 × 4.
+        points: (N, 3) x and y from the picture's upper left corner, and linear depth, which has no derivative.
+        planes: (H, W, 8) of the sample in each cell, see `depth_planes`; the picture is `REACH` cells smaller on every
+            side. Depths in it are `even_depth`.
+        lens: (4,): a and b, of clip w a + b · depth; the depth that even depths count from; that of the near plane.
     """
-    return COVERAGE(cells, points, planes)
+    return COVERAGE(cells, points, planes, lens)
+
+
+def is_inside(points: Array, size: tuple[int, int], lens: Array) -> Array:
+    """True for points (N, 3) in a picture (height, width), behind its near plane; see `coverage`."""
+    x, y, depth = (points[:, i] for i in range(3))
+    return (x >= 0) & (x <= size[1]) & (y >= 0) & (y <= size[0]) & (depth >= lens[3])
+
+
+def even_depth(depth: Array, lens: Array) -> Array:
+    """A depth that grows evenly with x and y on planes: linear depth itself if orthographic, else as −1 / depth."""
+    return (depth - lens[2]) / (lens[0] + lens[1] * depth)
 
 
 def cubic(d: Array) -> Array:
@@ -47,9 +62,13 @@ def quadratic(d: Array) -> Array:
     return xp.where(d < 0.5, 0.75 - d * d, tail * tail / 2)
 
 
-def _specification(cells: Array, points: Array, planes: Array) -> Array:
+def _specification(cells: Array, points: Array, planes: Array, lens: Array) -> Array:
     xp, at, translucent = namespace(cells), stopped(points), cells.shape[1] > 2
-    (height, width), (x, y, depth) = planes.shape[:2], (at[:, i] for i in range(3))
+    height, width = planes.shape[:2]
+    inside = is_inside(at, (height - 2 * REACH, width - 2 * REACH), lens)
+    x, y = (REACH + xp.where(inside, at[:, i], 0.0) for i in range(2))
+    # Beside the picture, nothing lies in front.
+    depth = xp.where(inside, even_depth(xp.where(inside, at[:, 2], lens[2]), lens), -FAR)
     corner = [xp.floor(xp.clip(c - 1.5, 0, n - 4)) for c, n in ((x, width), (y, height))]
     dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
     first = xp.astype(corner[1], xp.int32) * width + xp.astype(corner[0], xp.int32)
@@ -102,7 +121,7 @@ def _stacked(ids: list[Array], weights: list[Array]) -> tuple[Array, Array]:
     return xp.stack(ids, axis=1), xp.stack(weights, axis=1)
 
 
-def _shape(cells: tuple[int, ...], points: tuple[int, ...], planes: tuple[int, ...]) -> tuple[int, int]:
+def _shape(cells: tuple[int, ...], points: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, int]:
     return points[0], 1
 
 
@@ -115,7 +134,7 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 COVERAGE = Operation.of_loops(
     "rts.coverage",
     _specification,
-    (2, 2, 3),
+    (2, 2, 3, 1),
     _shape,
     _loops,
     differentiable=2,

@@ -12,17 +12,19 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
 from rts.errors import InputError
-from rts.operations.depth_limits import BIAS, FAR, OWN
+from rts.operations.depth_limits import BIAS, FAR, OWN, REACH
 
 WORK = 400
 """Nanoseconds for a point, roughly."""
 
 
-def forward(cells: np.ndarray, points: np.ndarray, planes: np.ndarray, out: np.ndarray) -> np.ndarray:
+def forward(
+    cells: np.ndarray, points: np.ndarray, planes: np.ndarray, lens: np.ndarray, out: np.ndarray
+) -> np.ndarray:
     """Fill `out` (N, 1) with the covered shares. Returns (N,) bool, true where the derivative may not be zero."""
-    _check(cells, points, planes)
+    _check(cells, points, planes, lens)
     kept = np.empty(len(points), np.bool_)
-    parallel(_forward, len(points), cells, points, planes, out, kept, work=WORK * len(points))
+    parallel(_forward, len(points), cells, points, planes, lens, out, kept, work=WORK * len(points))
     return kept
 
 
@@ -30,6 +32,7 @@ def push(
     cells: np.ndarray,
     points: np.ndarray,
     planes: np.ndarray,
+    lens: np.ndarray,
     t_cells: np.ndarray | None,
     t_points: np.ndarray | None,
     out: np.ndarray,
@@ -41,13 +44,14 @@ def push(
     t_cells = np.zeros_like(cells) if t_cells is None else t_cells
     t_points = np.zeros_like(points) if t_points is None else t_points
     work = WORK * len(points) // 4
-    parallel(_push, len(points), cells, points, planes, t_cells, t_points, kept, out, work=work)
+    parallel(_push, len(points), cells, points, planes, lens, t_cells, t_points, kept, out, work=work)
 
 
 def pull(
     cells: np.ndarray,
     points: np.ndarray,
     planes: np.ndarray,
+    lens: np.ndarray,
     g: np.ndarray,
     g_cells: np.ndarray | None,
     g_points: np.ndarray | None,
@@ -58,15 +62,15 @@ def pull(
     kept = np.ones(len(points), np.bool_) if kept is None else kept
     g_cells = np.zeros_like(cells) if g_cells is None else g_cells
     g_points = np.zeros_like(points) if g_points is None else g_points
-    _pull(cells, points, planes, g, g_cells, g_points, kept)
+    _pull(cells, points, planes, lens, g, g_cells, g_points, kept)
 
 
-def _check(cells: np.ndarray, points: np.ndarray, planes: np.ndarray) -> None:
+def _check(cells: np.ndarray, points: np.ndarray, planes: np.ndarray, lens: np.ndarray) -> None:
     """Refuse arrays of other shapes."""
     height, width, channels = planes.shape
     fits = cells.shape[0] == height * width and cells.shape[1] in (2, 3) and points.shape[1] == 3
-    if not fits or channels != 8 or min(height, width) < 4:
-        shapes = ", ".join(str(x.shape) for x in (cells, points, planes))
+    if not fits or channels != 8 or min(height, width) <= 2 * REACH or len(lens) != 4:
+        shapes = ", ".join(str(x.shape) for x in (cells, points, planes, lens))
         raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
 
 
@@ -86,6 +90,16 @@ def _quadratic(d):
         return 0.75 - d * d
     tail = max(1.5 - d, 0.0)
     return tail * tail / 2
+
+
+@compiled
+def _placed(point, n, planes, lens):
+    """A point's x, y and even depth among the cells; −`FAR`, before all of them, beside the picture."""
+    x, y, depth = float(point[n, 0]), float(point[n, 1]), float(point[n, 2])
+    height, width = planes.shape[0] - 2 * REACH, planes.shape[1] - 2 * REACH
+    if not (x >= 0 and x <= width and y >= 0 and y <= height and depth >= lens[3]):
+        return 0.0, 0.0, -FAR
+    return x + REACH, y + REACH, (depth - lens[2]) / (lens[0] + lens[1] * depth)
 
 
 @compiled
@@ -195,12 +209,14 @@ def _cell(x, y, planes, number):
 
 
 @loop
-def _forward(start, stop, cells, points, planes, out, kept):
+def _forward(start, stop, cells, points, planes, lens, out, kept):
     covers, depths, fronts = _tables()
     for n in range(start, stop):
-        x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+        x, y, depth = _placed(points, n, planes, lens)
         out[n, 0], kept[n] = 0, False
-        if not _some_front(x, y, depth, planes) or not _look(cells, x, y, depth, planes, covers, depths, fronts):
+        if depth == -FAR or not _some_front(x, y, depth, planes):
+            continue
+        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         even = True
         for c in range(1, 16):
@@ -214,10 +230,10 @@ def _forward(start, stop, cells, points, planes, out, kept):
 
 
 @loop
-def _push(start, stop, cells, points, planes, t_cells, t_points, kept, out):
+def _push(start, stop, cells, points, planes, lens, t_cells, t_points, kept, out):
     covers, depths, fronts = _tables()
     for n in range(start, stop):
-        x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+        x, y, depth = _placed(points, n, planes, lens)
         out[n, 0], total = 0, 0.0
         if not kept[n] or not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
@@ -235,10 +251,10 @@ def _push(start, stop, cells, points, planes, t_cells, t_points, kept, out):
 
 
 @loop
-def _pull(cells, points, planes, g, g_cells, g_points, kept):
+def _pull(cells, points, planes, lens, g, g_cells, g_points, kept):
     covers, depths, fronts = _tables()
     for n in range(len(points)):
-        x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+        x, y, depth = _placed(points, n, planes, lens)
         if not kept[n] or g[n, 0] == 0 or not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         for s in range(SIDES):

@@ -10,3 +10,5 @@ RIM = 1.2
 """How many times as much depth rises in the last step before a smooth rim as in the step before, at least."""
 FLAT = 0.5
 """Where the side of a cell of a flat surface lies, in cells from its centre."""
+REACH = 2
+"""Cells around a picture that its points read."""

@@ -5,6 +5,8 @@ Pictures are of samples without derivative, evaluated with derivatives: see `rts
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,13 +16,9 @@ from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
 from rts.contracts.checks import is_real
 from rts.errors import InputError
-from rts.operations.coverage import coverage
+from rts.operations.coverage import coverage, even_depth, is_inside
 from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
-
-REACH = 2
-"""Cells around a picture that `visibility` reads."""
-
 
 @record(static=("size",))
 class Picture:
@@ -30,14 +28,14 @@ class Picture:
         camera: the camera. Differentiable.
         cells: (K, H · W, 2 or 3), see `rts.operations.coverage`, of K layers. Differentiable.
         planes: (K, H, W, 8), likewise.
-        middle: () a depth of the scene's, from which depths are counted.
+        lens: (4,), see `rts.operations.coverage`.
         size: (height, width) of the picture.
     """
 
     camera: Camera
     cells: Array
     planes: Array
-    middle: Array
+    lens: Array
     size: tuple[int, int]
 
 
@@ -77,12 +75,17 @@ def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
         raise InputError(f"outside is {quoted(outside)}; expected a number from 0 to 1")
     context = context_of(seen, points)
     seen, points = context.constants((seen, points))
-    xp = namespace(points)
-    share, anywhere = xp.ones_like(points[:, 0]), xp.zeros_like(points[:, 0], dtype=xp.bool)
+    xp, share, inside = namespace(points), 1.0, []
     for picture in seen.pictures:
-        one, inside = _of_picture(picture, points)
-        share, anywhere = share * one, anywhere | inside
-    return xp.where(anywhere, share, outside)
+        placed = xp.astype(picture.camera.project(points, picture.size), picture.cells.dtype, copy=False)
+        for layer in range(picture.cells.shape[0]):
+            hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...], picture.lens)
+            share = share * (1 - hidden[:, 0])
+        if outside != 1:
+            inside.append(is_inside(stopped(placed), picture.size, picture.lens))
+    # Points outside are not hidden.
+    share = share * xp.ones_like(points[:, 0])
+    return xp.where(functools.reduce(operator.or_, inside), share, outside) if inside else share
 
 
 def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
@@ -110,44 +113,25 @@ def picture_of(
     xp, there, still = namespace(depth), row >= 0, stopped(camera)
     count = xp.sum(xp.astype(there, depth.dtype))
     middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
-    even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
+    lens = _lens(still, middle)
+    depth = xp.where(there, depth, middle)
+    even, unit = even_depth(depth, lens), _even_width(depth, still, lens, size)
     unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
     of_layers = [depth_planes(even[k, ...], unit[k, ...]) for k in layers]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
     cells: Array = xp.zeros_like(planes[..., :2]) if moving is None else moving
     cells = cells if alpha is None else xp.concat([cells, alpha], axis=-1)
-    return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, middle, size)
+    return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, lens, size)
 
 
-def _even_depths(depth: Array, camera: Camera, middle: Array, size: tuple[int, int]) -> tuple[Array, Array]:
-    """`even_depth` of depths, and the even depth of a cell's width there."""
+def _lens(camera: Camera, middle: Array) -> Array:
+    """See `rts.operations.coverage`; `middle` is the depth that even depths count from."""
+    xp, p, (near, _) = namespace(middle), camera.projection, camera.depth_range()
+    return xp.astype(xp.stack([p[3, 3], -p[3, 2], middle, near]), middle.dtype, copy=False)
+
+
+def _even_width(depth: Array, camera: Camera, lens: Array, size: tuple[int, int]) -> Array:
+    """The even depth of a cell's width at depths."""
     p, xp = camera.projection, namespace(depth)
     width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return even_depth(depth, camera, middle), width * _clip_w(middle, camera) / _clip_w(depth, camera)
-
-
-def even_depth(depth: Array, camera: Camera, middle: Array) -> Array:
-    """A depth that grows evenly with x and y on planes: linear depth itself if orthographic, else as −1 / depth."""
-    return (depth - middle) / _clip_w(depth, camera)
-
-
-def _clip_w(depth: Array, camera: Camera) -> Array:
-    """Clip w at linear depths."""
-    return camera.projection[3, 3] - camera.projection[3, 2] * depth
-
-
-def _of_picture(picture: Picture, points: Array) -> tuple[Array, Array]:
-    """Visibility (N,) in one picture, 1 outside, and whether points are inside (N,) bool."""
-    xp, (height, width), camera = namespace(points), picture.size, stopped(picture.camera)
-    placed = picture.camera.project(points, picture.size)
-    still, depth, (near, _) = stopped(placed), stopped(placed)[:, 2], camera.depth_range()
-    inside = (still[:, 0] >= 0) & (still[:, 0] <= width) & (still[:, 1] >= 0) & (still[:, 1] <= height)
-    inside = inside & (depth >= near)
-    share = xp.ones_like(depth)
-    even = even_depth(xp.where(inside, depth, picture.middle), camera, picture.middle)
-    placed = xp.where(inside[:, None], placed[:, :2], 0.0) + REACH
-    placed = xp.astype(xp.concat([placed, even[:, None]], axis=1), picture.cells.dtype, copy=False)
-    for layer in range(picture.cells.shape[0]):
-        hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...])
-        share = share * (1 - hidden[:, 0])
-    return xp.where(inside, share, 1.0), inside
+    return width * (lens[0] + lens[1] * lens[2]) / (lens[0] + lens[1] * depth)

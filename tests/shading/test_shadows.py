@@ -267,10 +267,12 @@ class TestCoverage(OperationConformance):
         planes[..., 0] = np.where(near, rng.uniform(-1, 0, (height, width)), 8.0) + 0.2 * np.arange(width)
         planes[..., 1], planes[..., 2] = rng.random((height, width)) < 0.9, 0.2
         planes[..., 4:] = rng.uniform(0, 1, (height, width, 4))
-        points = np.stack([rng.uniform(2, 9, 40), rng.uniform(2, 7, 40), np.zeros(40)], axis=1)
-        points[:, 2] = 8.0 + 0.2 * (points[:, 0] - 0.5)
+        # Some of them beside the picture, some before its near plane.
+        points = np.stack([rng.uniform(-1, 8, 40), rng.uniform(-1, 6, 40), np.zeros(40)], axis=1)
+        points[:, 2] = 1 / (1 / 3 - (8.0 + 0.2 * (points[:, 0] + 1.5)) / 24)
+        points[::9, 2] = 0.1
         cells = np.concatenate([np.zeros((height * width, 2)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
-        return [cells, points, planes]
+        return [cells, points, planes, np.array([0.0, 1 / 3, 3.0, 0.2])]
 
 
 @pytest.mark.parametrize(
