@@ -94,10 +94,9 @@ def _picture(
         return picture_of(depth, None, None, row, place, size)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
     place = constants(scene.camera, engine_of(splats.positions), splats.positions)
-    positions, rgba = (_in_cells(x, splats.row) for x in (splats.positions, splats.rgba))
-    return picture_of(
-        stopped(positions[..., 2]), positions[..., :2], None if opaque else rgba[..., -1:], splats.row, place, size
-    )
+    positions = _in_cells(splats.positions, splats.row)
+    alpha = None if opaque else _in_cells(splats.rgba[:, -1:], splats.row)
+    return picture_of(stopped(positions[..., 2]), positions[..., :2], alpha, splats.row, place, size)
 
 
 def _in_cells(values: Array, row: Array) -> Array:

@@ -18,9 +18,7 @@ WORK = 400
 """Nanoseconds for a point, roughly."""
 
 
-def forward(
-    cells: np.ndarray, points: np.ndarray, planes: np.ndarray, lens: np.ndarray, out: np.ndarray
-) -> np.ndarray:
+def forward(cells: np.ndarray, points: np.ndarray, planes: np.ndarray, lens: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Fill `out` (N, 1) with the covered shares. Returns (N,) bool, true where the derivative may not be zero."""
     _check(cells, points, planes, lens)
     kept = np.empty(len(points), np.bool_)

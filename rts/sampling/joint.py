@@ -16,7 +16,6 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -105,19 +104,19 @@ class Joint:
         """
         from rts.sampling import joint_loops
 
-        ids = fragments.triangle_ids
+        ids, proxy = fragments.triangle_ids, self.proxy
         covered = ids >= 0 if covered is None else covered
-        packed = pack_fragments(fragments, self.proxy, None, covered)
-        counts, *sorted_rows, row = joint_loops.by_part(
-            ids[covered], self.starts, packed.ids, packed.params, packed.row
+        assert proxy.ids is not None
+        counts, *of_samples, row, depth = joint_loops.packed_by_part(
+            fragments, covered, self.starts, proxy.ids, proxy.corner_params
         )
         ends = np.cumsum(np.maximum(counts, 1))[:-1]
-        tables = zip(*(np.split(x, ends) for x in sorted_rows), counts > 0, strict=True)
+        tables, none = zip(*(np.split(x, ends) for x in of_samples), counts > 0, strict=True), np.asarray(0, np.int32)
         samples = []
         for part, (ids_of_part, params, seen) in zip(self.parts, tables, strict=True):
             used = np.arange(len(ids_of_part), dtype=np.int32)[None, None] - np.int32(not seen)
-            samples.append(Samples(ids_of_part, params, Cells(used), packed.overflow, gbuffer_names=part.reads))
-        return Sampled(tuple(samples), Cells(row, packed.depth, ids), packed.overflow)
+            samples.append(Samples(ids_of_part, params, Cells(used), none, gbuffer_names=part.reads))
+        return Sampled(tuple(samples), Cells(row, depth, ids), none)
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:

@@ -1,65 +1,103 @@
-"""Samples of joined parts sorted by part, compiled."""
+"""Samples of joined parts packed part by part, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.compiling.loops import loop
-from rts.compiling.threads import parallel, read_only
+from rts.compiling.threads import TASKS_PER_THREAD, parallel, read_only, thread_count
+from rts.contracts.records import Fragments
 
 
-def by_part(
-    triangles: np.ndarray, starts: np.ndarray, ids: np.ndarray, params: np.ndarray, row: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Samples in the order of their parts; those of one part keep theirs.
+def packed_by_part(
+    fragments: Fragments, covered: np.ndarray, starts: np.ndarray, table: np.ndarray, corner_params: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The samples of fragments as `packing.pack_fragments` makes them, but part after part.
 
     Args:
-        triangles: (N,) int32, of samples, counted over all parts.
+        fragments: (K, H, W), whose triangles are counted over all parts.
+        covered: (K, H, W) bool, the cells in which there is one.
         starts: (P + 1,) int32, where the triangles of each part begin.
-        ids: (N, I) int32, of samples.
-        params: (N, P) float32, likewise.
-        row: (K, H, W) int32, indices of samples in cells, or −1.
+        table: (T, I) int32, ids of each triangle.
+        corner_params: (T, 3, Q) float32, or None for the barycentrics themselves.
 
     Returns:
-        The number (P,) of samples of each part; ids and params, with a row of zeros for each part that has none; and
-        the cells' rows.
+        The number (P,) of samples of each part; ids (N, I) and params (N, Q), with a row of zeros for each part that
+        has none; the cells' rows and depths (K, H, W), −1 and 0 where they have none.
     """
-    sizes = np.diff(starts)
-    part_of, counts = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), np.zeros(len(sizes), np.int64)
-    triangles = read_only(triangles)
-    _count(triangles, part_of, counts)
+    sizes, count = np.diff(starts), covered.size
+    part_of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    # Each piece of the cells is counted, then packed, by itself: how many there are changes nothing.
+    pieces = min(max(1, thread_count() * TASKS_PER_THREAD), max(1, count))
+    bounds = np.linspace(0, count, pieces + 1).astype(np.int64)
+    triangles, there = read_only(fragments.triangle_ids, np.int32).reshape(-1), read_only(covered).reshape(-1)
+    ahead = np.zeros((pieces, len(sizes)), np.int64)
+    parallel(_count, pieces, bounds, there, triangles, part_of, ahead, work=2 * count)
+    counts = ahead.sum(axis=0)
     rows = np.maximum(counts, 1)
-    new_ids, new_params = (np.zeros((rows.sum(), x.shape[1]), x.dtype) for x in (ids, params))
-    place, moved = np.empty(len(triangles), np.int32), np.empty(row.shape, np.int32)
-    ahead = np.cumsum(rows) - rows
-    _sort(triangles, part_of, ahead, read_only(ids), read_only(params), place, new_ids, new_params)
-    flat = read_only(row.reshape(-1), np.int32)
-    parallel(_renumber, row.size, flat, place, moved.reshape(-1), work=2 * row.size)
-    return counts, new_ids, new_params, moved
+    ahead = np.cumsum(ahead, axis=0) - ahead + np.cumsum(rows) - rows
+    corners = np.empty((0, 3, 0), np.float32) if corner_params is None else read_only(corner_params, np.float32)
+    width = 2 if corner_params is None else corners.shape[2]
+    ids, params = np.empty((rows.sum(), table.shape[1]), np.int32), np.empty((rows.sum(), width), np.float32)
+    for empty in np.flatnonzero(counts == 0):
+        first = rows[:empty].sum()
+        ids[first], params[first] = 0, 0
+    row, depth = np.empty(covered.shape, np.int32), np.empty(covered.shape, np.float32)
+    shares, depths = (
+        read_only(fragments.barycentrics, np.float32).reshape(-1, 2),
+        read_only(fragments.depth, np.float32),
+    )
+    arrays = there, triangles, shares, depths.reshape(-1), part_of, read_only(table, np.int32), corners
+    parallel(_pack, pieces, bounds, ahead, *arrays, ids, params, row.reshape(-1), depth.reshape(-1), work=8 * count)
+    return counts, ids, params, row, depth
 
 
 @loop
-def _count(triangles, part_of, counts):
-    """Add to `counts` (P,) the samples of each part."""
-    for n in range(len(triangles)):
-        counts[part_of[triangles[n]]] += 1
+def _count(start, stop, bounds, there, triangles, part_of, counts):
+    """Add to rows [start, stop) of `counts` (pieces, P) the samples of each part in these pieces of the cells."""
+    for piece in range(start, stop):
+        for m in range(bounds[piece], bounds[piece + 1]):
+            if there[m]:
+                counts[piece, part_of[triangles[m]]] += 1
 
 
 @loop
-def _sort(triangles, part_of, ahead, ids, params, place, new_ids, new_params):
-    """Put each sample behind those of its part, of which the next one goes to row `ahead` (P,); fill `place` (N,)."""
-    for n in range(len(triangles)):
-        part = part_of[triangles[n]]
-        to = ahead[part]
-        ahead[part], place[n] = to + 1, to
-        for c in range(ids.shape[1]):
-            new_ids[to, c] = ids[n, c]
-        for c in range(params.shape[1]):
-            new_params[to, c] = params[n, c]
+def _pack(
+    start, stop, bounds, ahead, there, triangles, shares, depths, part_of, table, corners, ids, params, row, depth
+):
+    """Pack the samples of pieces [start, stop) of the cells; see `packed_by_part`.
 
-
-@loop
-def _renumber(start, stop, row, place, moved):
-    """Fill entries [start, stop) of `moved` (M,) with the places of samples; −1 for none."""
-    for m in range(start, stop):
-        moved[m] = place[row[m]] if row[m] >= 0 else -1
+    Args:
+        start: the first piece.
+        stop: the piece after the last.
+        bounds: (pieces + 1,), where each begins.
+        ahead: (pieces, P) the next row of each part; counted up.
+        there: (M,) bool.
+        triangles: (M,) int32.
+        shares: (M, 2) barycentrics.
+        depths: (M,).
+        part_of: (T,) int32.
+        table: (T, I).
+        corners: (T, 3, Q), or no rows for the barycentrics.
+        ids: (N, I) to fill.
+        params: (N, Q) to fill.
+        row: (M,) to fill.
+        depth: (M,) to fill.
+    """
+    for piece in range(start, stop):
+        for m in range(bounds[piece], bounds[piece + 1]):
+            if not there[m]:
+                row[m], depth[m] = -1, 0
+                continue
+            t, a, b = triangles[m], shares[m, 0], shares[m, 1]
+            n = ahead[piece, part_of[t]]
+            ahead[piece, part_of[t]] = n + 1
+            for i in range(ids.shape[1]):
+                ids[n, i] = table[t, i]
+            if len(corners) == 0:
+                params[n, 0], params[n, 1] = a, b
+            else:
+                for i in range(params.shape[1]):
+                    c = corners[t, 2, i]
+                    params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
+            row[m], depth[m] = n, depths[m]

@@ -20,6 +20,7 @@ from rts.operations.coverage import coverage, even_depth, is_inside
 from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
 
+
 @record(static=("size",))
 class Picture:
     """The samples that a camera sees in front, and their planes; with `REACH` cells around the picture.
