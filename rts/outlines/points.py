@@ -273,7 +273,8 @@ class Points:
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
             order = np.argsort(depth, axis=0, kind="stable")[:count]
             part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
-        return _lit(Fronts(part, np.full(none, -1, np.int32), depth), np.array(scene.opaque))
+        fronts = Fronts(part, np.full(none, -1, np.int32), np.where(part >= 0, depth, 0.0))
+        return _lit(fronts, np.array(scene.opaque))
 
 
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
@@ -290,6 +291,8 @@ def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
     """The surfaces seen at points (K, ...), without what lies behind an opaque layer."""
+    if not opaque.any():
+        return layers
     part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
     for layer in part:
         layer[hidden] = -1

@@ -52,7 +52,7 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 
     size = layers.part.shape[1:]
     ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
-    for part, _, depth in zip(*layers, strict=True):
+    for part, _, depth in zip(*layers, strict=True) if opaque.any() else ():
         solid = (part >= 0) & opaque[part]
         ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
     met, marks = np.zeros((2, *size), np.uint8), False

@@ -71,7 +71,11 @@ def cells(first, last, positions, rgba, row, joined, out):
     through, behind = np.empty(most), np.empty((most, count))
     for i in range(first * width, last * width):
         y, x = i // width, i % width
-        layers, out[y, x] = _weigh(rgba, row, y, x, through), 0.0
+        for c in range(2 * count):
+            out[y, x, c] = 0.0
+        layers = _weigh(rgba, row, y, x, through)
+        if layers == 0:
+            continue
         _stack(rgba, row, y, x, layers, behind)
         for k in range(layers):
             n = row[k, y, x]
@@ -91,7 +95,11 @@ def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
     through, behind = np.empty(most), np.empty((most, count))
     for i in range(first * width, last * width):
         y, x = i // width, i % width
-        layers, out[y, x] = _weigh(rgba, row, y, x, through), 0.0
+        for c in range(2 * count):
+            out[y, x, c] = 0.0
+        layers = _weigh(rgba, row, y, x, through)
+        if layers == 0:
+            continue
         _stack(rgba, row, y, x, layers, behind)
         for k in range(layers if len(t_rgba) else 0):
             n = row[k, y, x]
@@ -114,6 +122,8 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     for i in range(height * width):
         y, x = i // width, i % width
         layers = _weigh(rgba, row, y, x, through)
+        if layers == 0:
+            continue
         _stack(rgba, row, y, x, layers, behind)
         for k in range(layers if len(g_rgba) else 0):
             n, hidden = row[k, y, x], 0.0
