@@ -294,12 +294,11 @@ class OnAllCores:
 
     Args:
         function: a function that several threads may call at once.
-        together: the operands of each item → the results of each, found in another way; or None where there is none.
+        together: the operands of each item → the results of each, found in another way; None for items that it cannot
+            do.
     """
 
-    def __init__(
-        self, function: Callable, together: Callable[[Sequence[Sequence[Any]]], list[Any] | None] | None = None
-    ):
+    def __init__(self, function: Callable, together: Callable[[Sequence[Sequence[Any]]], list[Any]] | None = None):
         self._function, self._together = function, together
 
     def __call__(self, *operands: Any) -> Any:
@@ -308,5 +307,8 @@ class OnAllCores:
 
     def many(self, items: Sequence[Sequence[Any]]) -> list[Any]:
         """The function's results for the operands of each item."""
-        results = None if self._together is None else self._together(items)
-        return each(lambda operands: self._function(*operands), items) if results is None else results
+        results = [None] * len(items) if self._together is None else self._together(items)
+        left = [index for index, found in enumerate(results) if found is None]
+        for index, found in zip(left, each(lambda i: self._function(*items[i]), left), strict=True):
+            results[index] = found
+        return results

@@ -25,7 +25,7 @@ def found_in_batch(
     centres: Sequence[Fronts],
     inputs: Sequence[Sequence[Tree]],
     most: int | None,
-) -> list[tuple[Found, list[Samples]]] | None:
+) -> list[tuple[Found, list[Samples]] | None]:
     """Outlines and the samples beside breaks, as of `found_in_views`, of each item of a batch.
 
     Args:
@@ -36,21 +36,21 @@ def found_in_batch(
         most: the number of breaks that there is room for in each item, if it is limited.
 
     Returns:
-        None where not all items can be drawn at once, or one has more breaks than there is room for.
+        None for items that cannot be drawn along with others, or have more breaks than there is room for.
     """
-    views = []
-    for one in zip(scenes, grids, inputs, strict=True):
-        view = View.of(*one)
-        if view is None or (views and view.kind != views[0].kind):
-            return None
-        views.append(view)
-    found, count = [], at_once(grids[0].size)
-    for first in range(0, len(views), count):
-        chunk = slice(first, first + count)
-        of_chunk = _found_in_picture(views[chunk], centres[chunk])
-        if most is not None and any(len(one.place) > most for one, _ in of_chunk):
-            return None
-        found += of_chunk
+    views = [View.of(*one) for one in zip(scenes, grids, inputs, strict=True)]
+    found: list[tuple[Found, list[Samples]] | None] = [None] * len(views)
+    kinds: dict[tuple, list[int]] = {}
+    for index, view in enumerate(views):
+        if view is not None:
+            kinds.setdefault(view.kind, []).append(index)
+    count = at_once(grids[0].size)
+    for alike in kinds.values():
+        for first in range(0, len(alike), count):
+            chunk = alike[first : first + count]
+            together = [view for view in (views[index] for index in chunk) if view is not None]
+            for index, one in zip(chunk, _found_in_picture(together, [centres[i] for i in chunk]), strict=True):
+                found[index] = one if most is None or len(one[0].place) <= most else None
     return found
 
 

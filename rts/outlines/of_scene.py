@@ -125,13 +125,11 @@ def _found_on_host(
             (found,), more = found_in_views([points], [centres], count)
         return in_arrays(here.parts, found, more)
 
-    def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]] | None:
+    def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         known = [entered(arrays) for arrays in items]
         scenes, grids, centres, of_proxies = zip(*known, strict=True)
         batch = found_in_batch(scenes, grids, centres, of_proxies, most)
-        if batch is None:
-            return None
-        return [in_arrays(own.parts, *one) for own, one in zip(scenes, batch, strict=True)]
+        return [None if one is None else in_arrays(own[0].parts, *one) for own, one in zip(known, batch, strict=True)]
 
     def in_arrays(parts: Sequence[CheckedPart], found: Found, more: Sequence[Samples]) -> list[np.ndarray]:
         arrays_of = []

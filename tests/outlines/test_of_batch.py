@@ -27,12 +27,12 @@ class Glass(rts.Shader):
 
 @pytest.fixture
 def items(monkeypatch):
-    """The numbers of items whose outlines were found at once; None where they were found item by item."""
+    """For each call the number of items whose outlines were found at once."""
     counts, find = [], of_scene.found_in_batch
 
     def counted(scenes, *given):
         found = find(scenes, *given)
-        counts.append(None if found is None else len(found))
+        counts.append(sum(one is not None for one in found))
         return found
 
     monkeypatch.setattr(of_scene, "found_in_batch", counted)
@@ -73,7 +73,14 @@ def test_images_and_gradients_of_poses_are_those_of_a_loop(items, shader, option
 def test_poses_that_cut_the_image_are_found_one_by_one(items):
     (_, image), poses = loss_of("silhouette", scale=3.0), torch.tensor(POSES)
     torch.testing.assert_close(torch.vmap(image)(poses), torch.stack([image(p) for p in poses]), rtol=0, atol=2e-6)
-    assert items == [None]
+    assert items == [0]
+
+
+def test_one_pose_that_cuts_the_image_leaves_the_others_together(items):
+    (_, image), poses = loss_of("lambert"), torch.tensor(POSES)
+    poses[3, 3:] += torch.tensor([2.0, 0.0, 0.0])
+    torch.testing.assert_close(torch.vmap(image)(poses), torch.stack([image(p) for p in poses]), rtol=0, atol=2e-6)
+    assert items == [4]
 
 
 @pytest.mark.thorough
