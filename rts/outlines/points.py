@@ -231,8 +231,8 @@ class Points:
         """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         (sampler, camera, entry, sheets), checked = self._parts[part], self._scene.parts[part]
         plain = sheets is not None and not _refines(checked) and checked.surface.centered
-        if fragments is not None and plain and not self._scene.context.engine.differentiates:
-            # What the sampler's call to the host comes to.
+        if fragments is not None and plain and not pairs and not self._scene.context.engine.differentiates:
+            # What a call of the sampler comes to.
             return pack_fragments(fragments, entry.proxy).replace(gbuffer_names=checked.reads, at_points=True)
         if not len(points) and (sheets is None or _refines(checked)):
             # Surfaces may want a ray at least; nothing names its sample.

@@ -84,10 +84,9 @@ def sampled_scene(
     height, width = factor * size[0], factor * size[1]
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
-    given, host = scene, on_the_host(scene, grid)
-    if host is not None:
-        scene, grid = host
-        scene = with_joints(scene, grid) if joins and capacity is None and not settings.fronts else scene
+    given, (scene, grid) = scene, on_the_host(scene, grid)
+    if scene.cameras and joins and capacity is None and not settings.fronts:
+        scene = with_joints(scene, grid)
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
     uniform = uniform and not settings.fronts
@@ -98,7 +97,7 @@ def sampled_scene(
         triangle = sampled.triangle if settings.fronts else None
         sampled = with_outlines(sampled, scene, grid, capacity).replace(triangle=triangle)
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
-    return sampled if host is None else in_engine(sampled, given)
+    return in_engine(sampled, given) if scene.cameras else sampled
 
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:

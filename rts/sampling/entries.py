@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.array_functions import shape_of
 from rts.arrays.engines import stopped, value_of
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
@@ -19,16 +20,15 @@ from rts.scene.camera import Camera
 def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
     for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
-        value = value_of(x)
-        if value is None or value.ndim != x.ndim:
+        if value_of(x) is None or is_batched(x):
             return False
     return True
 
 
 def is_batched(x: Array) -> bool:
-    """True for an array of which a transform maps over several values."""
+    """True for an array, or a number, of which a transform maps over several values."""
     value = value_of(x)
-    return value is not None and value.ndim != x.ndim
+    return value is not None and value.ndim != len(shape_of(x))
 
 
 def host_value(x: Array) -> np.ndarray:

@@ -19,16 +19,14 @@ from rts.sampling.scene import Grid, Scene
 from rts.sampling.triangle_sampler import TriangleSampler
 
 
-def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid] | None:
+def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     """A scene of triangles on the host, and its cells: entries and cameras of all parts, in place of θ and transforms.
 
-    None where values are traced, or several at once; where a sampler has a way of its own; and for engines that pad.
+    Only entries are added for engines that pad; nothing where values are traced, or several at once, or where a sampler
+    has a way of its own.
     """
-    like = scene.context.like
-    if like is not None and scene.context.engine.padded(like):
-        return None
     if not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
-        return None
+        return scene, grid
     parts, entries, cameras = [], [], []
     for index, (part, sampler, entry) in enumerate(zip(scene.parts, scene.samplers, scene.entries, strict=True)):
         # The product that later projects the samples, to the bit.
@@ -40,6 +38,9 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid] | None:
         parts.append(replace(part, theta={}, transform=None))
         entries.append(entry)
         cameras.append(camera)
+    like = scene.context.like
+    if like is not None and scene.context.engine.padded(like):
+        return scene._replace(entries=entries), grid
     context = Context(engine_of(), np.zeros((), real_of(scene)))
     here = scene._replace(parts=parts, entries=entries, cameras=cameras, context=context)
     return here, grid._replace(camera=on_host(grid.camera))
@@ -55,7 +56,7 @@ def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:
 def real_of(scene: Scene) -> type:
     """The dtype of a scene's floating arrays."""
     like = scene.context.like
-    return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
+    return np.float64 if like is None or floating_bits(like) == 64 else np.float32
 
 
 def in_engine(sampled: Sampled, scene: Scene) -> Sampled:

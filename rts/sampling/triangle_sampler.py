@@ -63,6 +63,7 @@ class TriangleSampler(Sampler):
     def prepare(self, proxy: Proxy) -> Any:
         """Build the input of `rasterize`: an acceleration structure, device buffers.
 
+        Results are independent of one another: those of all parts may be built before one of them is drawn.
         The default returns the proxy, once its `faces` are found to name vertices; else it raises an InputError.
         """
         check_faces(proxy)

@@ -5,8 +5,6 @@ Pictures are of samples without derivative, evaluated with derivatives: see `rts
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -76,17 +74,16 @@ def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
         raise InputError(f"outside is {quoted(outside)}; expected a number from 0 to 1")
     context = context_of(seen, points)
     seen, points = context.constants((seen, points))
-    xp, share, inside = namespace(points), 1.0, []
+    xp = namespace(points)
+    share, inside = xp.ones_like(points[:, 0]), xp.zeros_like(points[:, 0], dtype=xp.bool)
     for picture in seen.pictures:
         placed = xp.astype(picture.camera.project(points, picture.size), picture.cells.dtype, copy=False)
         for layer in range(picture.cells.shape[0]):
             hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...], picture.lens)
             share = share * (1 - hidden[:, 0])
         if outside != 1:
-            inside.append(is_inside(stopped(placed), picture.size, picture.lens))
-    # Points outside are not hidden.
-    share = share * xp.ones_like(points[:, 0])
-    return xp.where(functools.reduce(operator.or_, inside), share, outside) if inside else share
+            inside = inside | is_inside(stopped(placed), picture.size, picture.lens)
+    return share if outside == 1 else xp.where(inside, share, outside)
 
 
 def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:

@@ -39,7 +39,7 @@ def weigh_breaks(gap, near, slope, rows, inner, pair, places, shown, points, mov
             points[b, i, 0] = gap[b, 1] + 0.5 + places[b, i] * gap[b, 2]
             points[b, i, 1] = gap[b, 0] + 0.5 + places[b, i] * (1 - gap[b, 2])
         for i in range(2):
-            of = near[b] if paired else i
+            of = min(near[b], 1) if paired else i
             origins[b, i, 0], origins[b, i, 1] = points[b, of, 0], points[b, of, 1]
         moves[b] = 0.0
         if paired:
