@@ -40,7 +40,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     count = len(gaps.gap)
     room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
-    seen = *fronts, np.empty((count, 2, 2), np.int32), np.empty((count, 2))
+    seen = *map(read_only, fronts), np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     known = gaps.gap, begins, spans, names, parts, *seen, INNER, rows, counts, whole, numbers
     parallel(spans_loops.breaks, count, *known, work=600 * count)
     count = counts.sum()
