@@ -92,7 +92,7 @@ def names(crossings: list[Crossing]) -> list[str]:
     known: list[str] = []
     for crossing in crossings:
         call = crossing.way, crossing.line.rpartition(" ")[2]
-        if crossing.shape in ((), (1,), (3,), (6,), (4, 4)):
+        if not crossing.bytes or crossing.shape in ((), (1,), (3,), (6,), (4, 4)):
             known.append(NUMBERS)
             continue
         known.append(ORDER[call][found[call]] if call in ORDER else OF_OPERATIONS.get(call, call[1]))
@@ -101,12 +101,12 @@ def names(crossings: list[Crossing]) -> list[str]:
 
 
 NUMBERS = "matrices and single numbers"
-_OF_BREAKS = ("rows of breaks", "parts of breaks", "stacks", "places in stacks", "places of breaks", "gaps")
-_OF_BREAKS += ("points of breaks", "near", "slopes", "ends", "squares", "ties", "sides of squares", "beyond", "corners")
+_OF_SAMPLES = ("ids", "barycentrics", "row", "depth", "triangle")
+_OF_BREAKS = ("places of breaks", "gaps", "rows of breaks", "points of breaks", "inner rows", "pairs", "near", "slopes")
+_OF_BREAKS += ("ends", "squares", "ties", "sides of squares", "beyond", "corners", "pulls", "joined")
 ORDER = {
-    ("to the device", "samples"): ("ids", "barycentrics", "row", "depth", "triangle"),
-    ("to the device", "_found_on_host"): (*_OF_BREAKS, "pulls", "joined", "ids of breaks", "barycentrics of breaks"),
-    ("to the host", "_found_on_host"): ("vertices", "row", "depth", "triangle"),
+    ("to the device", "in_engine"): (*_OF_SAMPLES, *_OF_BREAKS),
+    ("to the host", "value_of"): ("vertices",),
     ("to the device", "table_of"): ("faces",),
 }
 """The arrays that cross in a call, in their order, numbers and matrices left out."""

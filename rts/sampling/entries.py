@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import stopped, value_of
+from rts.arrays.engines import CONSTANT_TYPES, engine_of, stopped, value_of
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
@@ -20,15 +20,23 @@ from rts.scene.camera import Camera
 def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
     for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
-        if value_of(x) is None or is_batched(x):
+        shape, value = _probed(x)
+        if value is None or value.ndim != len(shape):
             return False
     return True
 
 
 def is_batched(x: Array) -> bool:
     """True for an array, or a number, of which a transform maps over several values."""
-    value = value_of(x)
-    return value is not None and value.ndim != len(shape_of(x))
+    shape, value = _probed(x)
+    return value is not None and value.ndim != len(shape)
+
+
+def _probed(x: Array) -> tuple[tuple[int, ...], np.ndarray | None]:
+    """The shape and the value of an array; on another device, of an empty part of it, so that nothing crosses."""
+    if not isinstance(x, CONSTANT_TYPES) and len(shape_of(x)) and not engine_of(x).on_host(x):
+        x = x[:0, ...]
+    return shape_of(x), value_of(x)
 
 
 def host_value(x: Array) -> np.ndarray:

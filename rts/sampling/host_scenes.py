@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, floating_bits, is_constant
+from rts.arrays.engines import Context, engine_of, floating_bits, is_constant, namespace
 from rts.arrays.trees import collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples
@@ -69,10 +69,13 @@ def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
         return sampled
     samples = [_evaluated(*one, real_of(scene)) for one in zip(scene.parts, sampled.samples, strict=True)]
     sampled = replace(sampled, samples=tuple(samples))
-    arrays = collected(sampled)
-    specs = [ArraySpec(x.shape, x.dtype) for x in arrays]
-    moved = iter(engine.call_host(lambda *_: arrays, specs, *([] if like is None else [like])))
-    return map_leaves(lambda _: next(moved), sampled)
+    arrays = {id(x): x for x in collected(sampled)}  # Some stand in it twice, such as the cells of a single part.
+    specs = [ArraySpec(x.shape, x.dtype) for x in arrays.values()]
+    # None of its numbers cross: it only says where to.
+    place = [] if like is None else [namespace(like).reshape(like, (-1,))[:0]]
+    results = engine.call_host(lambda *_: list(arrays.values()), specs, *place)
+    moved = dict(zip(arrays, results, strict=True))
+    return map_leaves(lambda x: moved[id(x)], sampled)
 
 
 def _evaluated(part: CheckedPart, samples: Samples, real: type) -> Samples:
