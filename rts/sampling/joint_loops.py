@@ -7,6 +7,7 @@ import numpy as np
 from rts.compiling.loops import loop
 from rts.compiling.threads import TASKS_PER_THREAD, parallel, read_only, thread_count
 from rts.contracts.records import Fragments
+from rts.sampling.packing_loops import write_sample
 
 
 def packed_by_part(
@@ -92,12 +93,5 @@ def _pack(
             t, a, b = triangles[m], shares[m, 0], shares[m, 1]
             n = ahead[piece, part_of[t]]
             ahead[piece, part_of[t]] = n + 1
-            for i in range(ids.shape[1]):
-                ids[n, i] = table[t, i]
-            if len(corners) == 0:
-                params[n, 0], params[n, 1] = a, b
-            else:
-                for i in range(params.shape[1]):
-                    c = corners[t, 2, i]
-                    params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
+            write_sample(n, t, a, b, table, corners, ids, params)
             row[m], depth[m] = n, depths[m]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling.loops import loop
+from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
 from rts.contracts.records import Fragments
 
@@ -105,6 +105,19 @@ def _count(start, stop, kept, counts):
         counts[y] = count
 
 
+@compiled
+def write_sample(n, t, a, b, table, corners, ids, params):
+    """Write row n of ids (N, I) and params (N, P): a triangle's ids, and its corners at the first two barycentrics."""
+    for i in range(ids.shape[1]):
+        ids[n, i] = table[t, i]
+    if len(corners) == 0:
+        params[n, 0], params[n, 1] = a, b
+    else:
+        for i in range(params.shape[1]):
+            c = corners[t, 2, i]
+            params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
+
+
 @loop
 def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
     """Pack the kept fragments of lines [start, stop); see `_Lines` for the first four arrays.
@@ -131,13 +144,6 @@ def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners,
                 row[y, x], depth[y, x] = -1, 0
                 continue
             t, a, b = triangle_ids[y, x], barycentrics[y, x, 0], barycentrics[y, x, 1]
-            for i in range(ids.shape[1]):
-                ids[n, i] = table[t, i]
-            if len(corners) == 0:
-                params[n, 0], params[n, 1] = a, b
-            else:
-                for i in range(params.shape[1]):
-                    c = corners[t, 2, i]
-                    params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
+            write_sample(n, t, a, b, table, corners, ids, params)
             row[y, x], depth[y, x] = n, depths[y, x]
             n += 1
