@@ -17,7 +17,8 @@ SCRIPT = Path(__file__).parents[1] / "distributed_fit.py"
 
 def run(count, *args, restarts=0):
     """The output of the script in `count` processes."""
-    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    # torchrun looks seldom whether a process has ended, so that the others have time to say so before they are stopped.
+    launch = ["-m", "torch.distributed.run", "--standalone", "--monitor-interval", "3", "--nproc-per-node", str(count)]
     command = [sys.executable, *(launch if count > 1 else []), *(["--max-restarts", str(restarts)] if restarts else [])]
     paths = [str(SCRIPT.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     environment = {
