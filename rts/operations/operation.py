@@ -45,7 +45,7 @@ class Operation:
     `crosses`), and all floats have one dtype, float32 or float64. Otherwise, and for second derivatives,
     `specification` runs. Under `vmap` they are called for each item, by several threads perhaps. An operation is called
     with its operands, and with parameters by name. Parameters are hashable values, not arrays, and are passed to all of
-    its functions but `used`.
+    its functions but `used`. Their names are not `kept`, `wanted` or `single`, which engines pass themselves.
 
     `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
     fill `out` and `results` in place.

@@ -9,13 +9,14 @@ from typing import Any
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.shader import Shader
 from rts.errors import InputError
+from rts.operations.means import Channels, channels_of
 from rts.operations.unit import unit
 from rts.plugin_base import promised
 from rts.rendering.settings import RenderSettings
@@ -25,8 +26,6 @@ MEANS = {"depth": 1, "normal": 3, "position": 3, "uv": 2}
 """Name → number of channels, of outputs that are means over what is covered of a pixel."""
 FRONTS = ("depth_front", "part", "triangle")
 """Outputs of the sample in front at the centre of a pixel."""
-LEAST_ALPHA = 1e-3
-"""Pixels of a smaller alpha count as empty: what little is covered of them tells no mean."""
 
 
 class Outputs:
@@ -57,7 +56,7 @@ class Outputs:
         self._widths: dict[str, set[int]] = {name: set() for name in self.means}
 
     def of_scene(self, scene: Scene) -> Scene:
-        """The scene with shaders that give the means, too, as channels before alpha."""
+        """The scene with shaders that give the means, too, as channels before the colours."""
         return self.of_scenes([scene])[0]
 
     def of_scenes(self, scenes: Sequence[Scene]) -> list[Scene]:
@@ -94,7 +93,7 @@ class Outputs:
         return sum(max(self._widths[name], default=MEANS.get(name, 0)) for name in self.means)
 
     def taken(self, image: Array, fronts: Sequence[Array], channels: int) -> dict[str, Array]:
-        """The outputs by name, of an image (..., C + M + 1) of C `channels` of colour, M of means, and alpha.
+        """The outputs by name, of an image (..., M + C + 1) of M channels of means, C `channels` of colour, and alpha.
 
         Raises:
             InputError: no part has "uv"; or an attribute has other numbers of channels in some parts.
@@ -107,23 +106,22 @@ class Outputs:
                 raise InputError(
                     f"the attribute {name!r} has {sorted(widths)} numbers a sample, by part; expected as many in all"
                 )
-        xp, outputs = namespace(image), {}
-        # Cut at once: the derivative of a slice is an array as large as the image.
-        sizes = channels, *(next(iter(self._widths[name])) for name in self.means), 1
-        pieces = engine_of(image).split(xp.moveaxis(image, -1, 0), sizes)
-        color, *means, alpha = (xp.moveaxis(piece, 0, -1) for piece in pieces)
-        covered = alpha >= LEAST_ALPHA
-        for name, piece in zip(self.means, means, strict=True):
+        found, first = {}, 0
+        for name in self.means:
+            (width,) = self._widths[name]
             # The mean of normals of length 1; other means are shares of what is covered.
-            size = _length(piece) if name == "normal" else alpha
-            outputs[name] = piece * xp.where(covered, 1 / xp.where(covered, size, 1.0), 0.0)
-        outputs |= {"color": xp.concat([color, alpha], axis=-1), "alpha": alpha}
-        outputs |= zip(self.fronts, fronts, strict=True)
+            found[name] = Channels(first, width, "direction" if name == "normal" else "mean")
+            first += width
+        found["color"] = Channels(first, channels + 1, "value")
+        found["alpha"] = Channels(first + channels, 1, "value")
+        wanted = [name for name in self.names if name not in FRONTS]
+        arrays = channels_of(image, [found[name] for name in wanted]) if wanted else []
+        outputs = {**dict(zip(wanted, arrays, strict=True)), **dict(zip(self.fronts, fronts, strict=True))}
         return {name: outputs[name] for name in self.names}
 
 
 class _Widened(Shader):
-    """A shader whose colours are followed by the means of some outputs, times alpha."""
+    """A shader whose colours follow the means of some outputs, times alpha."""
 
     def __init__(self, shader: Shader, outputs: Outputs):
         self._shader, self._outputs = shader, outputs
@@ -139,9 +137,11 @@ class _Widened(Shader):
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
         """See `rts.Shader`."""
         rgba, means = self._shader(theta, gbuffer, camera), self._outputs.channels(gbuffer, camera)
-        xp, alpha = namespace(rgba, gbuffer.like), rgba[:, -1:]
-        rows = xp.concat([xp.astype(x, rgba.dtype) for x in means], axis=1)
-        return xp.concat([rgba[:, :-1], rows * alpha, alpha], axis=1)
+        xp = namespace(rgba, gbuffer.like)
+        rows = [xp.astype(x, rgba.dtype) for x in means]
+        if not self.opaque:
+            rows = [x * rgba[:, -1:] for x in rows]
+        return xp.concat([*rows, rgba], axis=1)
 
     def __repr__(self) -> str:
         return repr(self._shader)
@@ -209,13 +209,6 @@ def _front_depth(splats: Splats) -> Array:
         moved = at[..., axis] - stopped(at[..., axis])
         depth = depth - xp.where(there, slope * moved, 0.0)
     return depth
-
-
-def _length(x: Array) -> Array:
-    """The lengths (..., 1) of vectors (..., 3); 1 for those that are zero."""
-    xp = namespace(x)
-    square = xp.sum(x * x, axis=-1, keepdims=True)
-    return xp.sqrt(xp.where(square > 0, square, 1.0))
 
 
 def _unknown(name: str, gbuffer: GBuffer) -> str:

@@ -338,7 +338,7 @@ class Camera(CameraConverters):
 
     def depth(self, points: Array) -> Array:
         """(N,) linear depth of world points (N, 3)."""
-        return -affine(self.view[2, :], points)
+        return namespace(points).reshape(affine_map(-self.view[2:3, :], points), (-1,))
 
     def to_world(self, direction: Sequence[float]) -> Array:
         """(3,) the unit vector, in the world, of a direction (3,) in camera space."""
