@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, TypeGuard
+from functools import partial
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from rts.arrays.engines import constants, context_of, engine_of, exemplar, names
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
 from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count, is_real
-from rts.contracts.records import Splats
+from rts.contracts.records import Sampled, Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
 from rts.errors import InputError
@@ -27,7 +28,7 @@ from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.image import render
+from rts.rendering.image import image_of_splats, over_background, render
 from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
@@ -346,37 +347,19 @@ class ImageResiduals(Residuals):
             equations = [view.normal_equations(parameters) for view in self._views]
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
-        engine, equations = engine_of(parameters), None
-        splatter, ordinary = self._settings.splatter, self._ordinary and not self._sigma and self._image_channels == 3
-        ordinary = ordinary and self._outputs is None
-        if isinstance(splatter, SummingSplatter) and ordinary and engine.differentiates:
+        engine, splatter = engine_of(parameters), self._settings.splatter
+        if not (self._ordinary and self._outputs is None and engine.differentiates):
+            return normal_equations(self, parameters, engine, self.loss)
+        equations = None
+        if isinstance(splatter, SummingSplatter) and not self._sigma and self._image_channels == 3:
             equations = self._swept(parameters, engine, splatter)
-        return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
+        if equations is None:  # Derivatives are of the samples, which are found once, without them.
+            bands = [self._sampled(parameters, top, rows) for top, rows in self._settings.bands(self.size)]
+            equations = normal_equations(partial(self._of_samples, bands), parameters, engine, self.loss)
+        return equations
 
-    def _swept(self, parameters: Tree, engine: Engine, splatter: SummingSplatter) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` without a Jacobian: by the splatter's method of that name, band of rows by band.
-
-        None where the splatter's method gives None.
-        """
-        total: list[Array] = []
-        for top, rows in self._settings.bands(self.size):
-            equations = self._swept_band(parameters, engine, splatter, top, rows)
-            if equations is None:
-                return None
-            # Means over a band become shares of means over the image.
-            shares = [x * (rows / self.size[0]) for x in equations]
-            total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
-        value, matrix, gradient = total
-        return value, matrix, gradient
-
-    def _swept_band(
-        self, parameters: Tree, engine: Engine, splatter: SummingSplatter, top: int, rows: int
-    ) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` of a band: of `rows` rows of the image, from row `top` on, with means over the band alone.
-
-        None where the splatter's method gives None.
-        """
-        vector, unflatten = flatten(parameters)
+    def _sampled(self, parameters: Tree, top: int, rows: int) -> _Band:
+        """The samples of a band of the image: of `rows` rows, from row `top` on."""
         parts, camera = self.scene(parameters)
         size = rows, self.size[1]
 
@@ -386,23 +369,58 @@ class ImageResiduals(Residuals):
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
         scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
-        sampled = sampled_scene(scene, scene.camera, size, self._settings)
         self._refuse_other(scene.channels)
-        # Opaque samples have an alpha of one, whatever their colours.
-        colored = self._channels > 1 or not all(scene.opaque)
-        target, weights, background = (None if x is None else x[top : top + rows] for x in self._constants(vector))
+        sampled = sampled_scene(scene, scene.camera, size, self._settings)
+        return _Band(top, rows, window, sampled, all(scene.opaque))
 
-        def splats(v: Array) -> Splats:
-            parts, camera = _checked(*self.scene(unflatten(v)))
-            context = context_of(parts, camera, sampled, v)
-            return to_splats(sampled, parts, camera.for_size(self.size), window(camera), context)
+    def _splats(self, band: _Band, parameters: Tree) -> Splats:
+        """The splats of a band's samples at other values of the parameters."""
+        parts, camera = _checked(*self.scene(parameters))
+        context = context_of(parts, camera, band.sampled, parameters)
+        return to_splats(band.sampled, parts, camera.for_size(self.size), band.window(camera), context)
+
+    def _of_samples(self, bands: Sequence[_Band], parameters: Tree) -> Array:
+        """The residuals, as of `__call__`, from samples of all bands."""
+        splatter: Any = self._settings.splatter
+        drawn = [image_of_splats(splatter, self._splats(band, parameters), self.supersample) for band in bands]
+        image = drawn[0] if len(drawn) == 1 else namespace(*drawn).concat(drawn)
+        return self._difference(over_background(image, self._background), parameters)
+
+    def _swept(self, parameters: Tree, engine: Engine, splatter: SummingSplatter) -> tuple[Array, Array, Array] | None:
+        """`normal_equations` without a Jacobian: by the splatter's method of that name, band by band.
+
+        None where the splatter's method gives None.
+        """
+        total: list[Array] = []
+        for top, rows in self._settings.bands(self.size):
+            equations = self._swept_band(self._sampled(parameters, top, rows), parameters, engine, splatter)
+            if equations is None:
+                return None
+            # Means over a band become shares of means over the image.
+            shares = [x * (rows / self.size[0]) for x in equations]
+            total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
+        value, matrix, gradient = total
+        return value, matrix, gradient
+
+    def _swept_band(
+        self, band: _Band, parameters: Tree, engine: Engine, splatter: SummingSplatter
+    ) -> tuple[Array, Array, Array] | None:
+        """`normal_equations` of a band, with means over the band alone.
+
+        None where the splatter's method gives None.
+        """
+        vector, unflatten = flatten(parameters)
+        # Opaque samples have an alpha of one, whatever their colours.
+        colored = self._channels > 1 or not band.opaque
+        fields = self._constants(vector)
+        target, weights, background = (None if x is None else x[band.top : band.top + band.rows] for x in fields)
 
         def moved(v: Array) -> tuple[Array, Array]:
-            shown = splats(v)
+            shown = self._splats(band, unflatten(v))
             positions, rgba = constants((shown.positions, shown.rgba), engine, v)
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
-        known = constants(splats(vector), engine, vector)
+        known = constants(self._splats(band, unflatten(vector)), engine, vector)
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
         known = replace(known, positions=positions, rgba=rgba)
         loss = self.loss if self.loss.robust else None
@@ -438,6 +456,24 @@ class ImageResiduals(Residuals):
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
             background = xp.broadcast_to(background, (*self.size, self._image_channels + 1))
         return target, weights, background
+
+
+class _Band(NamedTuple):
+    """Some rows of an image, sampled at some parameters.
+
+    Attributes:
+        top: the first row.
+        rows: their number.
+        window: camera of the image → that of the band.
+        sampled: the samples.
+        opaque: whether all parts are.
+    """
+
+    top: int
+    rows: int
+    window: Callable[[Camera], Camera]
+    sampled: Sampled
+    opaque: bool
 
 
 def _checked_loss(loss: Any, f_scale: Any) -> Loss:

@@ -10,6 +10,7 @@ import rts
 import rts.fitting.least_squares
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
+from rts.fitting import image_residuals
 from rts.fitting.normal_equations import normal_equations
 from rts.rendering import settings
 from rts.splatting.edges import weights as edges_weights
@@ -289,6 +290,25 @@ def test_what_no_sweep_knows_is_done_by_the_jacobian(options, target, monkeypatc
     goal, weights = fields(3)
     check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, **options), start(target), 1e-5)
     assert not sweeps
+
+
+@pytest.mark.parametrize(("target", "fine"), [("torch-cpu", 1), ("torch-cpu", 3), ("jax", 1)])
+def test_the_jacobian_of_blurred_residuals_is_of_samples_that_are_found_once(target, fine, monkeypatch):
+    goal, weights = fields(3)
+    behind = np.random.default_rng(4).random((*SIZE, 3))
+    options = {"weights": weights, "background": behind, "supersample": fine, "layers": 2}
+    monkeypatch.setattr(settings, "BAND", 3000)
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, **options).at_stage(rts.Stage(sigma=1.5))
+    sampled, known = image_residuals.sampled_scene, []
+
+    def counted(scene, *args):
+        known.append(not scene.traced)
+        return sampled(scene, *args)
+
+    monkeypatch.setattr(image_residuals, "sampled_scene", counted)
+    residuals.normal_equations(start(target))
+    assert known == [True] * len(residuals._settings.bands(SIZE)) and (len(known) > 1) == (fine > 1)
+    check(residuals, start(target), 1e-4)
 
 
 # ------------------------------------------------------------------------------------------------------------ fits

@@ -119,9 +119,8 @@ def calibrate(
     fits = [problem.fitted(COARSE, progress) for problem in problems]
     best = min(range(len(fits)), key=lambda n: fits[n].loss)
     view = problems[best].view_at(fits[best].parameters)
-    near = _Problem(robot, masks, values, intrinsics, view, offsets, robust, apart=True).fitted(MIDDLE, progress)
     problem = _Problem(robot, masks, values, intrinsics, view, offsets, robust)
-    fit = problem.fitted(FULL, progress, near.parameters)
+    fit = problem.fitted(FULL, progress, problem.fitted(MIDDLE, progress).parameters)
     view = problem.view_at(fit.parameters)
     found = fit.parameters["offsets"].numpy().astype(np.float64) if offsets else np.zeros(0)
     moved = values + found @ problem.chosen
@@ -149,8 +148,8 @@ class _Problem:
     Parameters are `turn` (3,), a rotation vector about the robot's middle, radians, `shift` (3,), metres, and perhaps
     `offsets`: numbers of one array ought to be of like units.
 
-    The robot is one part, which takes less time, or its links are parts: `apart`. Coarse stages keep them apart, since
-    a start far off was lost with one part.
+    The robot is one part, which takes less time, or its links are parts: `apart`. The coarse stage keeps them apart,
+    since a start far off was lost with one part.
 
     Attributes:
         camera: the camera at `view`.

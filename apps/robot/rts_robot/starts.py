@@ -101,19 +101,26 @@ class _Coarse:
 
     def overlaps(self, poses: np.ndarray) -> np.ndarray:
         """Mean intersection over union (N,) of the cells that points fall into and those inside the masks."""
-        rows, columns = self.grid
-        found = np.zeros(len(poses))
-        for number, pose in enumerate(poses.astype(np.float32)):
-            seen = self.points @ pose[:3, :3].T + pose[:3, 3]
-            z = np.maximum(seen[..., 2], 1e-6)
-            x = np.floor(seen[..., 0] / z * self.focal[0] + self.middle[0])
-            y = np.floor(seen[..., 1] / z * self.focal[1] + self.middle[1])
-            valid = (seen[..., 2] > 1e-6) & (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-            covered = np.zeros((len(seen), rows, columns), bool)
-            view = np.nonzero(valid)[0]
-            covered[view, y[valid].astype(int), x[valid].astype(int)] = True
-            both = (covered & self.inside).sum(axis=(1, 2))
-            found[number] = np.mean(both / np.maximum((covered | self.inside).sum(axis=(1, 2)), 1))
+        (rows, columns), views = self.grid, len(self.points)
+        inside = self.inside.reshape(views, -1)
+        every, found = inside.sum(axis=1), np.zeros(len(poses))
+        first = np.repeat(rows * columns * np.arange(views, dtype=np.int32), self.points.shape[1])
+        points = np.ascontiguousarray(self.points.reshape(-1, 3).T)
+        to_cells = np.diag([*self.focal, 1.0])
+        to_cells[:2, 2] = self.middle
+        covered = np.zeros(views * rows * columns + 1, bool)  # The last one takes points outside.
+        for number, pose in enumerate((to_cells @ poses[:, :3]).astype(np.float32)):
+            x, y, z = pose[:, :3] @ points + pose[:, 3:]
+            valid = z > 1e-6
+            x, y = x / np.where(valid, z, 1), y / np.where(valid, z, 1)
+            valid &= (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+            with np.errstate(invalid="ignore"):  # Of points outside, which may be too far off for integers.
+                cells = first + columns * y.astype(np.int32) + x.astype(np.int32)
+            covered[:] = False
+            covered[np.where(valid, cells, len(covered) - 1)] = True
+            seen = covered[:-1].reshape(views, -1)
+            both = (seen & inside).sum(axis=1)
+            found[number] = np.mean(both / np.maximum(seen.sum(axis=1) + every - both, 1))
         return found
 
 
