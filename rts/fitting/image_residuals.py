@@ -32,7 +32,7 @@ from rts.rendering.image import image_of_splats, over_background, render
 from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
-from rts.rendering.splats import to_splats
+from rts.rendering.splats import owned, splats_of, to_splats
 from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
@@ -371,7 +371,7 @@ class ImageResiduals(Residuals):
         scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
         self._refuse_other(scene.channels)
         sampled = sampled_scene(scene, scene.camera, size, self._settings)
-        return _Band(top, rows, window, sampled, all(scene.opaque))
+        return _Band(top, rows, window, sampled, scene.parts)
 
     def _splats(self, band: _Band, parameters: Tree) -> Splats:
         """The splats of a band's samples at other values of the parameters."""
@@ -411,7 +411,7 @@ class ImageResiduals(Residuals):
         """
         vector, unflatten = flatten(parameters)
         # Opaque samples have an alpha of one, whatever their colours.
-        colored = self._channels > 1 or not band.opaque
+        colored = self._channels > 1 or not all(part.shader.opaque for part in band.parts)
         fields = self._constants(vector)
         target, weights, background = (None if x is None else x[band.top : band.top + band.rows] for x in fields)
 
@@ -420,9 +420,10 @@ class ImageResiduals(Residuals):
             positions, rgba = constants((shown.positions, shown.rgba), engine, v)
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
-        known = constants(self._splats(band, unflatten(vector)), engine, vector)
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
-        known = replace(known, positions=positions, rgba=rgba)
+        context, apron = context_of(vector), band.sampled.apron
+        sampled = owned(band.sampled, band.sampled.row, context)
+        known = constants(splats_of(sampled, band.parts, positions, rgba, context, apron), engine, vector)
         loss = self.loss if self.loss.robust else None
         tangents = t_positions, t_rgba if colored else None
         return splatter.normal_equations(known, *tangents, target, weights, background, loss)
@@ -466,14 +467,14 @@ class _Band(NamedTuple):
         rows: their number.
         window: camera of the image → that of the band.
         sampled: the samples.
-        opaque: whether all parts are.
+        parts: checked parts, at the same parameters.
     """
 
     top: int
     rows: int
     window: Callable[[Camera], Camera]
     sampled: Sampled
-    opaque: bool
+    parts: Sequence[CheckedPart]
 
 
 def _checked_loss(loss: Any, f_scale: Any) -> Loss:
