@@ -264,8 +264,10 @@ def render(
     seconds = time.perf_counter() - start
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
     what += f", {len(frames)} frames" if len(frames) > 1 else ""
-    _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
-    for line in lines if names != ("color",) else ():
+    lines = lines if names != ("color",) else []
+    wrote = "wrote" if lines else f"wrote {output}"
+    _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; {wrote}"))
+    for line in lines:
         _say(escape(f"  {line}"))
     if profile:
         typer.echo(rts.profile(lit(parts), seen, shape, **options))

@@ -25,7 +25,7 @@ from rts.fitting.losses import Loss
 from rts.fitting.normal_equations import flatten, normal_equations
 from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
-from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
+from rts.fitting.targets import as_mask, check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_of_splats, over_background, render
@@ -60,14 +60,15 @@ class ImageResiduals(Residuals):
         camera: the camera, if `scene` gives none; of several views a list, or the result of `Camera.stack`.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
-            or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
-            Of several views (B, H, W, ·), or a list. Or a dict of targets by the names of outputs of `rts.render`, such
-            as {"color": …, "depth": …}; of several views each (B, H, W, ·). Residuals are then in one row. Those of
-            means, such as depth, count as far as the pixel is covered: where nothing is seen, colours and alpha tell.
-            A depth or a normal of 0 in the target is one that was not measured, and does not count.
-        weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
-            bool; constants. Of several views (B, H, W, ·), or a list. For a dict of targets a dict, of arrays or of
-            numbers, such as {"depth": 0.1}; outputs that it leaves out have 1.
+            or (H, W, 4) with both. Floating, or a bool mask; a constant. For 3 and 4 read C and C + 1 where the image
+            has C channels. Of several views (B, H, W, ·), or a list. Or a dict of targets by the names of outputs of
+            `rts.render`, such as {"color": …, "depth": …}; of several views each (B, H, W, ·), or a list of dicts.
+            Residuals are then in one row. Those of means, such as depth, count as far as the pixel is covered: where
+            nothing is seen, colours and alpha tell. A depth or a normal of 0 in the target is one that was not
+            measured, and does not count.
+        weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape, such as a mask; or one number.
+            Floating or bool; constants. Of several views (B, H, W, ·), or a list. For a dict of targets a dict, such as
+            {"depth": 0.1}; outputs that it leaves out have 1.
         background: as in `render`; a constant, the same for every view.
         sampler: as in `render`.
         splatter: as in `render`.
@@ -133,10 +134,13 @@ class ImageResiduals(Residuals):
         self._of_outputs: dict[str, ImageResiduals] = {}
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
+        target, weights = _by_name(target), _by_name(weights)
         if isinstance(target, Mapping):
             named = {f"target[{name!r}]": x for name, x in target.items()}
             warn_of_gradients(named | {"weights": weights, "background": background})
-            self._take_outputs(target, {} if weights is None else weights, cameras)
+            views = [_view_count(x, self.size, several) for x in target.values()] if camera is None else []
+            count = next((count for count in views if count is not None), cameras)
+            self._take_outputs(target, {} if weights is None else weights, count)
             of_views = self._views or [self]
             refuse_zero([child._weights for view in of_views for child in view._of_outputs.values()])
             return
@@ -172,6 +176,8 @@ class ImageResiduals(Residuals):
 
     def _take_outputs(self, target: Mapping[str, Any], weights: Any, views: int | None) -> None:
         """Set targets and weights of outputs by name, of one view or of `views`, once checked."""
+        if not target:
+            raise InputError("target is an empty dict; expected targets by names of outputs, such as {'depth': array}")
         outputs = Outputs(list(target))
         # The alpha of pixels weighs means.
         self._outputs = tuple(dict.fromkeys((*outputs.names, *(["alpha"] if outputs.means else []))))
@@ -181,15 +187,17 @@ class ImageResiduals(Residuals):
             for name, of_output in target.items():
                 child = self._of_outputs[name] = copy(self)
                 child._of_outputs, child._background, child._mean = {}, None, name in outputs.means
-                child._target = _checked_output(name, of_output, self.size)
+                child._target = _checked_output(name, of_output, self.size, self._image_channels)
                 child._channels = 1 if len(child._target.shape) == 2 else child._target.shape[2]
                 factors = weights.get(name)
-                factors = np.full(self.size, factors, np.float32) if is_real(factors) else factors
                 factors = _checked_weights(factors, child._target.shape, self.size)
                 child._weights = _measured(child._target, factors) if name in ("depth", "normal") else factors
             return
-        if any((shape_of(x) or (0,))[0] != views for x in target.values()):
-            raise InputError(f"there are {views} cameras; expected {views} targets of each output, ({views}, H, W, ·)")
+        for name, x in target.items():
+            if (len(x) if isinstance(x, (list, tuple)) else (shape_of(x) or (0,))[0]) != views:
+                raise InputError(
+                    f"target[{name!r}] {described(x)}; expected those of {views} views, ({views}, H, W, ·)"
+                )
         for b in range(views):
             view = copy(self)
             view._view, view._views, view._of_outputs = b, [], {}
@@ -236,7 +244,7 @@ class ImageResiduals(Residuals):
         if weights is not None:
             difference = difference * weights
         if share is not None:
-            difference = difference * share
+            difference = difference * constants(share, engine_of(difference), difference)
         if self._sigma:
             difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
@@ -525,6 +533,16 @@ def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None
     return shape[0] if len(shape) > 3 or (shape[1:3] == size and (several or shape[:2] != size)) else None
 
 
+def _by_name(of_views: Any) -> Any:
+    """A dict of lists for a list of dicts, one for each view, of the same names; all else as it is."""
+    if not isinstance(of_views, (list, tuple)) or not any(isinstance(x, Mapping) for x in of_views):
+        return of_views
+    kinds = sorted({", ".join(sorted(x)) if isinstance(x, Mapping) else kind_of(x) for x in of_views})
+    if len(kinds) > 1:
+        raise InputError(f"views have targets or weights of unlike names: {'; '.join(kinds)}; expected the same in all")
+    return {name: [x[name] for x in of_views] for name in of_views[0]}
+
+
 def _of_views(weights: Any, count: int) -> Sequence[Any]:
     """The weights of each of `count` views: an array or list as given, or a list of None. Another number is refused."""
     if weights is None:
@@ -543,7 +561,7 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
     """The target, checked, its shape kept; and its own number of channels. Images have `channels` besides alpha."""
     if target is None:
         raise InputError("target is None; expected an array, such as what rts.load_image gives")
-    target = from_numbers(target, "target")
+    target = as_mask(from_numbers(target, "target"))
     shape = shape_of(target)
     if shape[:2] != size or shape[2:] not in ((), (1,), (channels,), (channels + 1,)):
         height, width = size
@@ -569,30 +587,31 @@ def _measured(target: Array, weights: Array | None) -> Array:
     return xp.reshape(weights, (*target.shape[:2], -1)) * there
 
 
-def _checked_output(name: str, target: Any, size: tuple[int, int]) -> Array:
-    """The target (H, W) or (H, W, ·) of an output, checked."""
-    target = from_numbers(target, f"target[{name!r}]")
+def _checked_output(name: str, target: Any, size: tuple[int, int], channels: int) -> Array:
+    """The target (H, W) or (H, W, ·) of an output, checked; `channels` of colours besides alpha."""
+    if name in ("part", "triangle"):
+        raise InputError(f"target has {name!r}, and indices have no derivative; compare 'depth', 'alpha' or 'color'")
+    target = as_mask(from_numbers(target, f"target[{name!r}]"))
     shape = shape_of(target)
-    if name in ("part", "triangle") or shape[:2] != size or len(shape) not in (2, 3):
+    if shape[:2] != size or len(shape) not in (2, 3):
         height, width = size
         raise InputError(
             f"target[{name!r}] {described(target)}; expected real numbers ({height}, {width}) or ({height}, {width}, ·)"
         )
     check_floating(f"target[{name!r}]", target)
     _check_finite(f"target[{name!r}]", target)
+    if name in ("color", "alpha"):
+        check_range(target, shape[2] if len(shape) > 2 else 1, channels)
     return target
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
     if weights is None:
         return None
-    weights = from_numbers(weights, "weights")
+    weights = as_mask(from_numbers(np.full(size, weights, np.float32) if is_real(weights) else weights, "weights"))
     allowed = dict.fromkeys((size, (*size, 1), tuple(shape)))
     if shape_of(weights) not in allowed:
         raise InputError(f"weights {described(weights)}; expected {' or '.join(map(str, allowed))}")
-    xp = namespace(weights)
-    if xp.isdtype(weights.dtype, "bool"):
-        return xp.astype(weights, xp.float32)
     check_floating("weights", weights)
     _check_finite("weights", weights)
     if (least := -largest(-weights)) < 0:

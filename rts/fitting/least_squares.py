@@ -181,13 +181,7 @@ def levenberg_marquardt(
         if not current.matrix.any() and len(run.history) == 1:
             refuse_independent(terms.of(terms.first()), None, parameters, engine)
         if not current.value or not current.gradient.any():
-            run.stop(
-                "the loss is zero"
-                if not current.value
-                else "the gradient is zero"
-                if current.matrix.any()
-                else NO_GRADIENT
-            )
+            run.stop(_at_rest(current))
             break
         damping = max(control.damping, model.least)
         delta, predicted = model.step(damping)
@@ -215,6 +209,15 @@ def levenberg_marquardt(
     _note_open(model, parameters, sizes, run)
 
 
+def _at_rest(current: Linearization) -> str:
+    """The reason, in words, that nothing can fall further."""
+    moves = bool(current.matrix.any())
+    if not current.value:
+        # Such as of depths where nothing is seen any more.
+        return "the loss is zero" if moves else "the loss and its derivatives are zero: nothing is compared any more"
+    return "the gradient is zero" if moves else NO_GRADIENT
+
+
 def _loss_rounding(linear: Linearization, count: int) -> float:
     """Rounding error of a mean loss of `count` residuals, each the difference of two numbers of about 1."""
     return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
@@ -228,7 +231,7 @@ def _no_step(jumps: bool, supersample: int | None) -> str:
     passes a sample.
     """
     if not jumps:
-        return "no step lowers the loss: a local minimum"
+        return "no step lowers the loss: a minimum, if perhaps a local one"
     if supersample is None:
         return (
             "no step lowers the loss, though the gradient promises it: the loss has jumps at this scale; where it is "

@@ -59,4 +59,13 @@ def refuse_zero(weights: Sequence[Array | None]) -> None:
         for view_weights in weights
     ]
     if not any(nonzero is None or nonzero.any() for nonzero in known):
-        raise InputError("weights are all zero, so that nothing is compared; expected some above zero")
+        raise InputError(
+            "weights are all zero, so that nothing is compared, or so are depths or normals, which then count as not "
+            "measured; expected some above zero"
+        )
+
+
+def as_mask(x: Array) -> Array:
+    """A mask of True and False in float32, as 1 and 0; other arrays as they are."""
+    xp = namespace(x)
+    return xp.astype(x, xp.float32) if xp.isdtype(x.dtype, "bool") else x

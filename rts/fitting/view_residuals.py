@@ -247,9 +247,10 @@ class ViewResiduals(Residuals):
             raise InputError(f"view {number}: {error}") from error
         if picture.shape[:2] != tuple(view.size) or picture.ndim > 3 or picture.dtype.kind != "f":
             height, width = view.size
+            hint = "; divide one from 0 to 255 by 255" if picture.dtype == np.uint8 else ""
             raise InputError(
                 f"view {number} ({view.name}) has a picture of shape {picture.shape} and dtype {picture.dtype}; "
-                f"expected floats of shape ({height}, {width}, ·), as its camera is for"
+                f"expected floats of shape ({height}, {width}, ·), as its camera is for{hint}"
             )
         self._warn_if_inverted(number, picture)
         known = picture.astype(np.float32, copy=False), self._factors(number, mask)

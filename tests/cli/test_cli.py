@@ -260,6 +260,9 @@ def test_render_writes_outputs_beside_the_picture_or_as_arrays(model, tmp_path):
     there = known["alpha"][..., 0] > 0.5
     np.testing.assert_allclose(pictures["normal"][there] / 127.5 - 1, known["normal"][there], atol=0.005)
     assert "one .npz" in fail("render", model, "-o", tmp_path / "a.png", "--outputs", "position", code=2)
+    alone = succeed("render", model, "-o", tmp_path / "b.png", "--size", 32, "--outputs", "depth")
+    assert "b.depth.png" in alone and "wrote b.png" not in alone.replace(f"{tmp_path}/", "")
+    assert not (tmp_path / "b.png").exists()
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

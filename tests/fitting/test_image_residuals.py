@@ -488,6 +488,13 @@ def test_colours_far_beyond_one_are_warned_of_and_features_are_not(target):
     rts.ImageResiduals(scene, [CAMERA] * 2, SIZE, masks, weights=masks)
 
 
+def test_masks_may_be_bool_and_weights_one_number():
+    mask = np.random.default_rng(2).random(SIZE) > 0.5
+    found = rts.ImageResiduals(scene, CAMERA, SIZE, mask, weights=0.5)(start(DIFFERENTIABLE[0]))
+    expected = rts.ImageResiduals(scene, CAMERA, SIZE, mask * 1.0, weights=np.full(SIZE, 0.5))(start(DIFFERENTIABLE[0]))
+    np.testing.assert_allclose(to_numpy(found), to_numpy(expected), atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["target", "weights", "background"])
 def test_what_requires_a_gradient_is_warned_of(name):
     torch = pytest.importorskip("torch")

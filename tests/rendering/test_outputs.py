@@ -202,16 +202,55 @@ def test_wrong_targets_of_outputs_are_refused():
 
     for target, message in (
         ({"depth": np.zeros((4, 4))}, r"target\['depth'\].*expected real numbers \(8, 8\)"),
-        ({"part": np.zeros((8, 8))}, r"target\['part'\]"),
+        ({"part": np.zeros((8, 8))}, "target has 'part', and indices have no derivative"),
+        ({"alpha": np.full((8, 8), 255.0)}, "target's alpha goes up to 255"),
         ({"depth": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
-        ({}, "expected a tuple of names"),
+        ({}, "target is an empty dict; expected targets by names of outputs"),
         ({"depth": np.zeros((8, 8))}, "all zero, so that nothing is compared"),
     ):
         with pytest.raises(rts.InputError, match=message):
             residuals(target)
     with pytest.raises(rts.InputError, match="weights is .*by names of targets: depth"):
         residuals({"depth": np.ones((8, 8))}, {"dept": 1.0})
-    with pytest.raises(rts.InputError, match="expected 2 targets of each output"):
+    with pytest.raises(rts.InputError, match=r"has shape \(8, 8\); expected those of 2 views, \(2, H, W, ·\)"):
         residuals({"depth": np.ones((8, 8))}, cameras=[camera, camera])
+    with pytest.raises(rts.InputError, match="unlike names: alpha; depth; expected the same"):
+        residuals([{"depth": np.ones((8, 8))}, {"alpha": np.ones((8, 8))}], cameras=[camera, camera])
+    with pytest.warns(rts.errors.InputWarning, match="target's colours go up to 200"):
+        residuals({"color": np.full((8, 8, 3), 200.0)})
     with pytest.raises(rts.InputError, match="expected 1 numbers a pixel"):
         residuals({"depth": np.ones((8, 8, 3))})({})
+
+
+def test_targets_of_views_are_arrays_lists_or_a_dict_for_each():
+    ball = mesh_part(icosphere(1), shader="silhouette")
+    cameras = [rts.Camera.look_at(eye, (0, 0, 0)) for eye in ((0, 0, 3), (3, 0, 0))]
+    views = [rts.render(ball, camera, (8, 8), outputs=("depth", "alpha")) for camera in cameras]
+    lists = {name: [2 * view[name] for view in views] for name in ("depth", "alpha")}
+    arrays_of, weights = {name: np.stack(x) for name, x in lists.items()}, [{"depth": 0.5}, {"depth": 2.0}]
+    dicts = [{name: 2 * x for name, x in view.items()} for view in views]
+    found = [
+        rts.ImageResiduals(lambda p: (ball, cameras), own, (8, 8), target, weights=weights)({})
+        for target in (arrays_of, lists, dicts)
+        for own in (cameras, None)
+    ]
+    assert found[0].any()
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+@pytest.mark.parametrize("method", ["lm", "adam"])
+def test_a_scene_that_forgets_its_parameters_is_told_so(method):
+    ball, camera = mesh_part(icosphere(1), shader="silhouette"), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    residuals = rts.ImageResiduals(lambda p: ball, camera, (8, 8), {"depth": np.full((8, 8), 2.0)})
+    with pytest.raises(rts.InputError, match="residuals do not depend on the parameters"):
+        rts.fit(residuals, torch.zeros(6), method=method, progress=False)
+
+
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
+def test_a_fit_to_depth_says_where_nothing_is_compared_any_more():
+    ball, camera = mesh_part(icosphere(1), shader="silhouette"), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    target = {"depth": 1000 * rts.render(ball, camera, (8, 8), outputs=("depth",))["depth"]}
+    residuals = rts.ImageResiduals(lambda p: ball.replace(transform=rts.rigid(p)), camera, (8, 8), target)
+    fit = rts.fit(residuals, torch.tensor([0.0, 0, 0, 0.1, 0, 0]), method="lm", progress=False)
+    assert fit.loss == 0 and "nothing is compared any more" in fit.reason
