@@ -193,10 +193,10 @@ def untraceable(error: Exception, engine: Engine) -> RtsError | None:
             f"{engine.name} cannot trace the function ({type(error).__name__}: {first}); use {engine.name} arrays "
             f"throughout and no values of them in Python, or pass jit=False where that is an argument"
         )
-    if isinstance(error, RuntimeError) and first.startswith("vmap: "):
+    if isinstance(error, RuntimeError) and (first.startswith("vmap: ") or "doesn't have storage" in first):
         return InputError(
             f"{engine.name} cannot take derivatives of the function along all unknowns at once ({first}); use "
-            f'no values of arrays in Python, or method="adam"'
+            f'no values of arrays in Python or NumPy, or method="adam"'
         )
     if type(error) in (TypeError, AttributeError) and engine.name in ENGINE_MARKS:
         met = [name for name, marks in ENGINE_MARKS.items() if any(m in str(error) for m in marks)]

@@ -135,3 +135,9 @@ def test_lm_shuns_trials_that_are_not_finite(target):
     fit = rts.fit(lambda p: p**0.1 - 0.5, start, method="lm", steps=100, tolerance=0)
     assert any(map(math.isnan, fit.history))
     np.testing.assert_allclose(to_numpy(fit.parameters), [0.5**10], rtol=1e-3)
+
+
+def test_values_that_leave_torch_are_refused_in_one_line():
+    torch = _torch()
+    with pytest.raises(rts.InputError, match=r"use no values of arrays in Python or NumPy, or method=\"adam\""):
+        rts.fit(lambda p: p + torch.from_numpy(p.detach().numpy()), torch.ones(3), method="lm", progress=False)

@@ -198,6 +198,7 @@ def test_a_fit_says_what_it_did_at_each_stage():
     np.testing.assert_array_equal(seen[firsts[2]][1], best)
     np.testing.assert_allclose(float((residuals(best) ** 2).mean()), ends[2][0], rtol=1e-4)
     assert f"in {fit.steps} steps ({' + '.join(map(str, fit.stages))})" in repr(fit)
+    assert repr(fit).startswith("loss of the last stage ")
 
 
 @pytest.mark.parametrize("method", ["lm", "adam"])
