@@ -78,10 +78,10 @@ class Fit(NamedTuple):
 
     def __repr__(self) -> str:
         # Losses of stages are those of other images.
-        loss = "loss of the last stage" if len(self.stages) > 1 else "loss"
         first = f"{self.history[-self.stages[-1]]:.4g} → " if self.stages[-1] else ""
-        steps = "1 step" if self.steps == 1 else f"{self.steps} steps"
+        loss, steps = "loss", "1 step" if self.steps == 1 else f"{self.steps} steps"
         if len(self.stages) > 1:
+            loss = "loss of the last stage"
             steps += f" ({' + '.join(map(str, self.stages))})"
         held = [f"{name} {tuple(x.shape)}" for name, x in named_leaves(self.parameters)]
         return (
