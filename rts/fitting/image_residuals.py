@@ -46,6 +46,12 @@ Scenes = Sequence[Sequence[Part] | Prepared]
 SceneFunction = Callable[[Tree], "Parts | Scenes | tuple[Parts | Scenes, Cameras]"]
 
 
+ZERO_UNMEASURED = ("depth", "normal")
+"""Outputs of which a target of 0 is not measured."""
+NOT_MEASURED = "; put 0 where nothing was measured"
+NOTHING_THERE = "; where there is nothing to compare with, put any number and give it a weight of 0"
+
+
 class ImageResiduals(Residuals):
     """The difference between the render of a scene and a target, as a function of the scene's parameters.
 
@@ -191,7 +197,7 @@ class ImageResiduals(Residuals):
                 child._channels = 1 if len(child._target.shape) == 2 else child._target.shape[2]
                 factors = weights.get(name)
                 factors = _checked_weights(factors, child._target.shape, self.size)
-                child._weights = _measured(child._target, factors) if name in ("depth", "normal") else factors
+                child._weights = _measured(child._target, factors) if name in ZERO_UNMEASURED else factors
             return
         for name, x in target.items():
             if (len(x) if isinstance(x, (list, tuple)) else (shape_of(x) or (0,))[0]) != views:
@@ -570,7 +576,7 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
             f"alpha, ({height}, {width}, {channels}) with colours, or ({height}, {width}, {channels + 1}) with both"
         )
     check_floating("target", target)
-    _check_finite("target", target)
+    _check_finite("target", target, NOTHING_THERE)
     count = shape[2] if len(shape) > 2 else 1
     check_range(target, count, channels)
     return target, count
@@ -599,7 +605,7 @@ def _checked_output(name: str, target: Any, size: tuple[int, int], channels: int
             f"target[{name!r}] {described(target)}; expected real numbers ({height}, {width}) or ({height}, {width}, ·)"
         )
     check_floating(f"target[{name!r}]", target)
-    _check_finite(f"target[{name!r}]", target)
+    _check_finite(f"target[{name!r}]", target, NOT_MEASURED if name in ZERO_UNMEASURED else NOTHING_THERE)
     if name in ("color", "alpha"):
         check_range(target, shape[2] if len(shape) > 2 else 1, channels)
     return target
@@ -619,10 +625,7 @@ def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]
     return weights
 
 
-def _check_finite(name: str, value: Array) -> None:
-    """Refuse NaN and infinity, where values are known."""
+def _check_finite(name: str, value: Array, hint: str = "") -> None:
+    """Refuse NaN and infinity, where values are known; a hint says what to do."""
     if not is_finite(value):
-        hint = "; where there is nothing to compare with, put any number and give it a weight of 0"
-        raise InputError(
-            f"{name} holds NaN or infinity; expected finite numbers{hint if name.startswith('target') else ''}"
-        )
+        raise InputError(f"{name} holds NaN or infinity; expected finite numbers{hint}")

@@ -204,7 +204,8 @@ def test_wrong_targets_of_outputs_are_refused():
         ({"depth": np.zeros((4, 4))}, r"target\['depth'\].*expected real numbers \(8, 8\)"),
         ({"part": np.zeros((8, 8))}, "target has 'part', and indices have no derivative"),
         ({"alpha": np.full((8, 8), 255.0)}, "target's alpha goes up to 255"),
-        ({"depth": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
+        ({"depth": np.full((8, 8), np.nan)}, "NaN.*put 0 where nothing was measured"),
+        ({"alpha": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
         ({}, "target is an empty dict; expected targets by names of outputs"),
         ({"depth": np.zeros((8, 8))}, "all zero, so that nothing is compared"),
     ):
