@@ -140,7 +140,7 @@ class ImageResiduals(Residuals):
         self._of_outputs: dict[str, ImageResiduals] = {}
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
-        target, weights = _by_name(target), _by_name(weights)
+        target, weights = _by_name(target), _by_name(weights, missing=1.0)
         if isinstance(target, Mapping):
             named = {f"target[{name!r}]": x for name, x in target.items()}
             warn_of_gradients(named | {"weights": weights, "background": background})
@@ -187,6 +187,7 @@ class ImageResiduals(Residuals):
         outputs = Outputs(list(target))
         # The alpha of pixels weighs means.
         self._outputs = tuple(dict.fromkeys((*outputs.names, *(["alpha"] if outputs.means else []))))
+        weights = dict.fromkeys(target, weights) if is_real(weights) else weights
         if not isinstance(weights, Mapping) or not set(weights) <= set(target):
             raise InputError(f"weights is {quoted(weights)}; expected a dict, by names of targets: {', '.join(target)}")
         if views is None:
@@ -204,10 +205,11 @@ class ImageResiduals(Residuals):
                 raise InputError(
                     f"target[{name!r}] {described(x)}; expected those of {views} views, ({views}, H, W, ·)"
                 )
+        of_views = {name: _of_views(x, views) for name, x in weights.items()}
         for b in range(views):
             view = copy(self)
             view._view, view._views, view._of_outputs = b, [], {}
-            factors = {name: x if is_real(x) else x[b] for name, x in weights.items()}
+            factors = {name: x[b] for name, x in of_views.items()}
             view._take_outputs({name: x[b] for name, x in target.items()}, factors, None)
             self._views.append(view)
 
@@ -354,7 +356,8 @@ class ImageResiduals(Residuals):
         """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
 
         J is the Jacobian of r. W and S are diagonals, ones for the loss "linear"; see `Loss.weights`. Of several views,
-        means over the views. The Jacobian (n, U) is made only where the splatter needs it, as for a blurred image.
+        means over the views. The Jacobian (n, U) is made only where it must be: of blurred images, of outputs by
+        name, of images of other than 3 channels besides alpha, in subclasses, and for splatters that sum up none.
         """
         if self._views and self._ordinary:
             self.scene(parameters)  # Refused where there are not as many cameras.
@@ -539,10 +542,16 @@ def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None
     return shape[0] if len(shape) > 3 or (shape[1:3] == size and (several or shape[:2] != size)) else None
 
 
-def _by_name(of_views: Any) -> Any:
-    """A dict of lists for a list of dicts, one for each view, of the same names; all else as it is."""
+def _by_name(of_views: Any, missing: Any = None) -> Any:
+    """A dict of lists for a list of dicts, one for each view; all else as it is.
+
+    Their names are the same, unless there is something to put in place of those that are `missing`.
+    """
     if not isinstance(of_views, (list, tuple)) or not any(isinstance(x, Mapping) for x in of_views):
         return of_views
+    if missing is not None and all(x is None or isinstance(x, Mapping) for x in of_views):
+        names = dict.fromkeys(name for x in of_views for name in x or ())
+        return {name: [(x or {}).get(name, missing) for x in of_views] for name in names}
     kinds = sorted({", ".join(sorted(x)) if isinstance(x, Mapping) else kind_of(x) for x in of_views})
     if len(kinds) > 1:
         raise InputError(f"views have targets or weights of unlike names: {'; '.join(kinds)}; expected the same in all")
@@ -551,8 +560,8 @@ def _by_name(of_views: Any) -> Any:
 
 def _of_views(weights: Any, count: int) -> Sequence[Any]:
     """The weights of each of `count` views: an array or list as given, or a list of None. Another number is refused."""
-    if weights is None:
-        return [None] * count
+    if weights is None or is_real(weights):
+        return [weights] * count
     weight_count = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
     if weight_count != count:
         raise InputError(f"weights are of {weight_count} views; expected {count}, as many as targets")
@@ -606,8 +615,9 @@ def _checked_output(name: str, target: Any, size: tuple[int, int], channels: int
         )
     check_floating(f"target[{name!r}]", target)
     _check_finite(f"target[{name!r}]", target, NOT_MEASURED if name in ZERO_UNMEASURED else NOTHING_THERE)
-    if name in ("color", "alpha"):
-        check_range(target, shape[2] if len(shape) > 2 else 1, channels)
+    count = shape[2] if len(shape) > 2 else 1
+    if name == "alpha" or (name == "color" and count == channels == 3):  # Four numbers may be features.
+        check_range(target, count, channels, f"target[{name!r}]")
     return target
 
 

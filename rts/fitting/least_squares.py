@@ -213,8 +213,8 @@ def _at_rest(current: Linearization) -> str:
     """The reason, in words, that nothing can fall further."""
     moves = bool(current.matrix.any())
     if not current.value:
-        # Such as of depths where nothing is seen any more.
-        return "the loss is zero" if moves else "the loss and its derivatives are zero: nothing is compared any more"
+        # No depth is compared where nothing is seen any more.
+        return "the loss is zero" if moves else "the loss and its derivatives are zero: all is met, or nothing compared"
     return "the gradient is zero" if moves else NO_GRADIENT
 
 

@@ -13,13 +13,14 @@ LARGEST = 2.0
 """Largest number to expect in a picture from 0 to 1 that was filtered or interpolated."""
 
 
-def check_range(target: Array, count: int, channels: int) -> None:
+def check_range(target: Array, count: int, channels: int, name: str = "target") -> None:
     """Refuse alpha far above 1, and warn of such colours. Unless `channels` is 3, they may have any value.
 
     Args:
         target: (H, W) or (H, W, count), floating.
         count: the target's channels: 1 is alpha, `channels` has no alpha, and `channels + 1` has alpha last.
         channels: the number of channels of the image besides alpha.
+        name: the target, in words.
 
     Raises:
         InputError: an alpha above 2.
@@ -30,10 +31,10 @@ def check_range(target: Array, count: int, channels: int) -> None:
     alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
     most = 0.0 if alpha is None else largest(alpha)
     if most > LARGEST:
-        raise InputError(f"target's alpha goes up to {most:g}; expected 0 to 1: divide one from 0 to 255 by 255")
+        raise InputError(f"{name}'s alpha goes up to {most:g}; expected 0 to 1: divide one from 0 to 255 by 255")
     if channels == 3 and count > 1 and (most := largest(target[..., :3])) > LARGEST:
         warn(
-            f"target's colours go up to {most:g}, and those of shaders from 0 to 1: divide a picture from 0 to 255 by "
+            f"{name}'s colours go up to {most:g}, and those of shaders from 0 to 1: divide a picture from 0 to 255 by "
             f"255, or let rts.load_image read it",
             InputWarning,
         )
@@ -60,12 +61,14 @@ def refuse_zero(weights: Sequence[Array | None]) -> None:
     ]
     if not any(nonzero is None or nonzero.any() for nonzero in known):
         raise InputError(
-            "weights are all zero, so that nothing is compared, or so are depths or normals, which then count as not "
-            "measured; expected some above zero"
+            "weights are all zero, so that nothing is compared; expected some above zero. A depth or a normal of zero "
+            "was not measured, and has a weight of zero"
         )
 
 
 def as_mask(x: Array) -> Array:
-    """A mask of True and False in float32, as 1 and 0; other arrays as they are."""
+    """A mask of True and False in float32, as 1 and 0; all else as it is."""
+    if not hasattr(x, "dtype"):
+        return x
     xp = namespace(x)
     return xp.astype(x, xp.float32) if xp.isdtype(x.dtype, "bool") else x

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
@@ -42,10 +43,16 @@ def channels_of(image: Array, groups: Sequence[Channels]) -> list[Array]:
 
 
 def _specification(image: Array, *, groups: tuple[Channels, ...], least: float) -> Array:
-    xp, alpha = namespace(image), image[:, -1:]
+    # Cut once, at all ends of groups.
+    xp, width = namespace(image), image.shape[1]
+    ends = sorted({0, width - 1, width, *(at for first, number, _ in groups for at in (first, first + number))})
+    sizes = [end - start for start, end in itertools.pairwise(ends)]
+    pieces = engine_of(image).split(xp.permute_dims(image, (1, 0)), sizes)
+    alpha = xp.permute_dims(pieces[-1], (1, 0))
     covered, found = alpha >= least, []
     for first, number, kind in groups:
-        piece = image[:, first : first + number]
+        of_group = pieces[ends.index(first) : ends.index(first + number)]
+        piece = xp.permute_dims(of_group[0] if len(of_group) == 1 else xp.concat(list(of_group)), (1, 0))
         if kind != "value":
             size = _length(piece) if kind == "direction" else alpha
             piece = piece * xp.where(covered, 1 / xp.where(covered, size, 1.0), 0.0)

@@ -337,8 +337,9 @@ class Camera(CameraConverters):
         return affine_map(toward_rows(self.view, self.projection), points)
 
     def depth(self, points: Array) -> Array:
-        """(N,) linear depth of world points (N, 3)."""
-        return namespace(points).reshape(affine_map(-self.view[2:3, :], points), (-1,))
+        """Linear depth (...) of world points (..., 3)."""
+        xp = namespace(points)
+        return xp.reshape(affine_map(-self.view[2:3, :], xp.reshape(points, (-1, 3))), tuple(points.shape[:-1]))
 
     def to_world(self, direction: Sequence[float]) -> Array:
         """(3,) the unit vector, in the world, of a direction (3,) in camera space."""

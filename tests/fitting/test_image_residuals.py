@@ -493,6 +493,8 @@ def test_masks_may_be_bool_and_weights_one_number():
     found = rts.ImageResiduals(scene, CAMERA, SIZE, mask, weights=0.5)(start(DIFFERENTIABLE[0]))
     expected = rts.ImageResiduals(scene, CAMERA, SIZE, mask * 1.0, weights=np.full(SIZE, 0.5))(start(DIFFERENTIABLE[0]))
     np.testing.assert_allclose(to_numpy(found), to_numpy(expected), atol=1e-6)
+    several = rts.ImageResiduals(scene, [CAMERA] * 2, SIZE, np.stack([mask, mask]), weights=0.5)
+    np.testing.assert_allclose(to_numpy(several(start(DIFFERENTIABLE[0])))[1], to_numpy(expected), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["target", "weights", "background"])

@@ -203,7 +203,11 @@ def test_wrong_targets_of_outputs_are_refused():
     for target, message in (
         ({"depth": np.zeros((4, 4))}, r"target\['depth'\].*expected real numbers \(8, 8\)"),
         ({"part": np.zeros((8, 8))}, "target has 'part', and indices have no derivative"),
-        ({"alpha": np.full((8, 8), 255.0)}, "target's alpha goes up to 255"),
+        ({"alpha": np.full((8, 8), 255.0)}, r"target\['alpha'\]'s alpha goes up to 255"),
+        ({"depth": None}, r"target\['depth'\] is a NoneType; expected real numbers"),
+        ({"depth": 2.0}, r"target\['depth'\] is a float; expected real numbers"),
+        (5.0, "target is a float; expected"),
+        ([{"depth": np.ones((8, 8))}], r"target\['depth'\] is a list; expected real numbers"),
         ({"depth": np.full((8, 8), np.nan)}, "NaN.*put 0 where nothing was measured"),
         ({"alpha": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
         ({}, "target is an empty dict; expected targets by names of outputs"),
@@ -217,8 +221,15 @@ def test_wrong_targets_of_outputs_are_refused():
         residuals({"depth": np.ones((8, 8))}, cameras=[camera, camera])
     with pytest.raises(rts.InputError, match="unlike names: alpha; depth; expected the same"):
         residuals([{"depth": np.ones((8, 8))}, {"alpha": np.ones((8, 8))}], cameras=[camera, camera])
-    with pytest.warns(rts.errors.InputWarning, match="target's colours go up to 200"):
+    with pytest.warns(rts.errors.InputWarning, match=r"target\['color'\]'s colours go up to 200"):
         residuals({"color": np.full((8, 8, 3), 200.0)})
+    two = {"depth": np.ones((2, 8, 8))}
+    for weights in ([{"depth": 0.5}], [{"depth": 0.5}] * 5, {"depth": np.ones((5, 8, 8))}):
+        with pytest.raises(rts.InputError, match="weights are of [15] views; expected 2"):
+            residuals(two, weights, [camera, camera])
+    with pytest.raises(rts.InputError, match="weights is a dict"):
+        residuals(np.ones((8, 8)), {"color": 1.0})
+    residuals({"color": np.full((8, 8, 4), 5.0)})  # Of features, perhaps.
     with pytest.raises(rts.InputError, match="expected 1 numbers a pixel"):
         residuals({"depth": np.ones((8, 8, 3))})({})
 
@@ -236,6 +247,11 @@ def test_targets_of_views_are_arrays_lists_or_a_dict_for_each():
         for own in (cameras, None)
     ]
     assert found[0].any()
+    some, plain = (
+        rts.ImageResiduals(lambda p: (ball, cameras), cameras, (8, 8), lists, weights=weights)({})
+        for weights in ([None, {"depth": 2.0}], None)
+    )
+    np.testing.assert_array_equal(some[0], plain[0])
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 
@@ -254,4 +270,4 @@ def test_a_fit_to_depth_says_where_nothing_is_compared_any_more():
     target = {"depth": 1000 * rts.render(ball, camera, (8, 8), outputs=("depth",))["depth"]}
     residuals = rts.ImageResiduals(lambda p: ball.replace(transform=rts.rigid(p)), camera, (8, 8), target)
     fit = rts.fit(residuals, torch.tensor([0.0, 0, 0, 0.1, 0, 0]), method="lm", progress=False)
-    assert fit.loss == 0 and "nothing is compared any more" in fit.reason
+    assert fit.loss == 0 and "all is met, or nothing compared" in fit.reason
