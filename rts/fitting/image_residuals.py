@@ -8,15 +8,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeGuard
 
-import numpy as np
-
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
+from rts.arrays.array_functions import described, kind_of, shape_of
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace, stopped
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
-from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count, is_real
+from rts.contracts.checks import check_background, check_ratio, check_sampler, is_count, is_real
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
@@ -25,7 +23,19 @@ from rts.fitting.losses import Loss
 from rts.fitting.normal_equations import flatten, normal_equations
 from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
-from rts.fitting.targets import as_mask, check_range, largest, refuse_zero, warn_of_gradients
+from rts.fitting.targets import (
+    ZERO_UNMEASURED,
+    by_name,
+    checked_output,
+    checked_target,
+    checked_weights,
+    measured,
+    refuse_zero,
+    shrunk,
+    view_count,
+    warn_of_gradients,
+    weights_of_views,
+)
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_of_splats, over_background, render
@@ -44,12 +54,6 @@ Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
 Scenes = Sequence[Sequence[Part] | Prepared]
 SceneFunction = Callable[[Tree], "Parts | Scenes | tuple[Parts | Scenes, Cameras]"]
-
-
-ZERO_UNMEASURED = ("depth", "normal")
-"""Outputs of which a target of 0 is not measured."""
-NOT_MEASURED = "; put 0 where nothing was measured"
-NOTHING_THERE = "; where there is nothing to compare with, put any number and give it a weight of 0"
 
 
 class ImageResiduals(Residuals):
@@ -140,18 +144,18 @@ class ImageResiduals(Residuals):
         self._of_outputs: dict[str, ImageResiduals] = {}
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
-        target, weights = _by_name(target), _by_name(weights, missing=1.0)
+        target, weights = by_name(target), by_name(weights, missing=1.0)
         if isinstance(target, Mapping):
             named = {f"target[{name!r}]": x for name, x in target.items()}
             warn_of_gradients(named | {"weights": weights, "background": background})
-            views = [_view_count(x, self.size, several) for x in target.values()] if camera is None else []
+            views = [view_count(x, self.size, several) for x in target.values()] if camera is None else []
             count = next((count for count in views if count is not None), cameras)
             self._take_outputs(target, {} if weights is None else weights, count)
             of_views = self._views or [self]
             refuse_zero([child._weights for view in of_views for child in view._of_outputs.values()])
             return
         warn_of_gradients({"target": target, "weights": weights, "background": background})
-        if (count := _view_count(target, self.size, several)) is None:
+        if (count := view_count(target, self.size, several)) is None:
             self._take(target, weights)
             refuse_zero([self._weights])
             if several:
@@ -161,7 +165,7 @@ class ImageResiduals(Residuals):
             return
         if cameras not in (None, count):
             raise InputError(f"there are {cameras} cameras for targets of {count} views; expected as many")
-        for b, (view_target, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
+        for b, (view_target, factors) in enumerate(zip(target, weights_of_views(weights, count), strict=True)):
             view = copy(self)
             view._view, view._views = b, []
             view._take(view_target, factors)
@@ -177,8 +181,8 @@ class ImageResiduals(Residuals):
 
     def _take(self, target: Any, weights: Any) -> None:
         """Set target and weights of one view, once checked. Shapes are those that the class says, without B."""
-        self._target, self._channels = _checked_target(target, self.size, self._image_channels)
-        self._weights = _checked_weights(weights, self._target.shape, self.size)
+        self._target, self._channels = checked_target(target, self.size, self._image_channels)
+        self._weights = checked_weights(weights, self._target.shape, self.size)
 
     def _take_outputs(self, target: Mapping[str, Any], weights: Any, views: int | None) -> None:
         """Set targets and weights of outputs by name, of one view or of `views`, once checked."""
@@ -194,18 +198,18 @@ class ImageResiduals(Residuals):
             for name, of_output in target.items():
                 child = self._of_outputs[name] = copy(self)
                 child._of_outputs, child._background, child._mean = {}, None, name in outputs.means
-                child._target = _checked_output(name, of_output, self.size, self._image_channels)
+                child._target = checked_output(name, of_output, self.size, self._image_channels)
                 child._channels = 1 if len(child._target.shape) == 2 else child._target.shape[2]
                 factors = weights.get(name)
-                factors = _checked_weights(factors, child._target.shape, self.size)
-                child._weights = _measured(child._target, factors) if name in ZERO_UNMEASURED else factors
+                factors = checked_weights(factors, child._target.shape, self.size)
+                child._weights = measured(child._target, factors) if name in ZERO_UNMEASURED else factors
             return
         for name, x in target.items():
             if (len(x) if isinstance(x, (list, tuple)) else (shape_of(x) or (0,))[0]) != views:
                 raise InputError(
                     f"target[{name!r}] {described(x)}; expected those of {views} views, ({views}, H, W, ·)"
                 )
-        of_views = {name: _of_views(x, views) for name, x in weights.items()}
+        of_views = {name: weights_of_views(x, views) for name, x in weights.items()}
         for b in range(views):
             view = copy(self)
             view._view, view._views, view._of_outputs = b, [], {}
@@ -288,7 +292,7 @@ class ImageResiduals(Residuals):
         other.size = stage.size(self.size)
         if other.size != self.size:
             if not self._views and not self._of_outputs:
-                other._target, other._weights = _shrunk(self._target, self._weights, other.size)
+                other._target, other._weights = shrunk(self._target, self._weights, other.size)
             if self._background is not None and len(self._background.shape) == 3:
                 other._background = box_filtered(self._background, other.size)
         return other
@@ -502,140 +506,11 @@ def _checked_loss(loss: Any, f_scale: Any) -> Loss:
     return loss
 
 
-def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:
-    """Target (H, W, …) and weights in fewer pixels `size` (h, w), with as many axes and channels as before.
-
-    A pixel of the target is the mean over its area by squared weights, or the plain mean where weights are all zero. A
-    weight is the root of the mean square; None stays None.
-    """
-    xp, kind = namespace(target, weights), target.shape
-    weights, target = constants((weights, target), engine_of(target, weights), exemplar((target, weights)))
-    target = xp.reshape(target, (*kind[:2], -1))
-    if weights is None:
-        return xp.reshape(box_filtered(target, size), (*size, *kind[2:])), None
-    shape = weights.shape
-    counts = xp.reshape(weights, (*kind[:2], -1)) ** 2
-    total = box_filtered(counts, size)
-    known = total > 0
-    mean = box_filtered(counts * target, size) / xp.where(known, total, xp.ones_like(total))
-    small = xp.where(known, mean, box_filtered(target, size))
-    return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
-
-
 def _are_cameras(value: Any) -> TypeGuard[Cameras]:
     """True for a camera, or a list or tuple of at least one."""
     cameras: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
     return len(cameras) > 0 and all(isinstance(camera, Camera) for camera in cameras)
 
 
-def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """The number of views of a target; None for a target of one view, without an axis of views.
-
-    Args:
-        target: as the user gave it. A list is of views if one of its entries has the size of the image.
-        size: (height, width).
-        several: True for several cameras. It decides where (H, W, ·) might be (B, H, W).
-    """
-    if isinstance(target, (list, tuple)):
-        return len(target) if any(shape_of(x)[:2] == size for x in target) else None
-    shape: Any = shape_of(target)
-    return shape[0] if len(shape) > 3 or (shape[1:3] == size and (several or shape[:2] != size)) else None
-
-
-def _by_name(of_views: Any, missing: Any = None) -> Any:
-    """A dict of lists for a list of dicts, one for each view; all else as it is.
-
-    Their names are the same, unless there is something to put in place of those that are `missing`.
-    """
-    if not isinstance(of_views, (list, tuple)) or not any(isinstance(x, Mapping) for x in of_views):
-        return of_views
-    if missing is not None and all(x is None or isinstance(x, Mapping) for x in of_views):
-        names = dict.fromkeys(name for x in of_views for name in x or ())
-        return {name: [(x or {}).get(name, missing) for x in of_views] for name in names}
-    kinds = sorted({", ".join(sorted(x)) if isinstance(x, Mapping) else kind_of(x) for x in of_views})
-    if len(kinds) > 1:
-        raise InputError(f"views have targets or weights of unlike names: {'; '.join(kinds)}; expected the same in all")
-    return {name: [x[name] for x in of_views] for name in of_views[0]}
-
-
-def _of_views(weights: Any, count: int) -> Sequence[Any]:
-    """The weights of each of `count` views: an array or list as given, or a list of None. Another number is refused."""
-    if weights is None or is_real(weights):
-        return [weights] * count
-    weight_count = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
-    if weight_count != count:
-        raise InputError(f"weights are of {weight_count} views; expected {count}, as many as targets")
-    return weights
-
-
 def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
     return check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
-
-
-def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:
-    """The target, checked, its shape kept; and its own number of channels. Images have `channels` besides alpha."""
-    if target is None:
-        raise InputError("target is None; expected an array, such as what rts.load_image gives")
-    target = as_mask(from_numbers(target, "target"))
-    shape = shape_of(target)
-    if shape[:2] != size or shape[2:] not in ((), (1,), (channels,), (channels + 1,)):
-        height, width = size
-        raise InputError(
-            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare with "
-            f"alpha, ({height}, {width}, {channels}) with colours, or ({height}, {width}, {channels + 1}) with both"
-        )
-    check_floating("target", target)
-    _check_finite("target", target, NOTHING_THERE)
-    count = shape[2] if len(shape) > 2 else 1
-    check_range(target, count, channels)
-    return target, count
-
-
-def _measured(target: Array, weights: Array | None) -> Array:
-    """Weights (H, W, 1 or ·) of a target (H, W) or (H, W, ·), and 0 where it is 0."""
-    xp = namespace(target)
-    there = xp.reshape(target, (*target.shape[:2], -1)) != 0
-    there = xp.astype(xp.any(there, axis=-1, keepdims=True), target.dtype)
-    if weights is None:
-        return there
-    weights, there = constants((weights, there), engine_of(target, weights), exemplar((target, weights)))
-    return xp.reshape(weights, (*target.shape[:2], -1)) * there
-
-
-def _checked_output(name: str, target: Any, size: tuple[int, int], channels: int) -> Array:
-    """The target (H, W) or (H, W, ·) of an output, checked; `channels` of colours besides alpha."""
-    if name in ("part", "triangle"):
-        raise InputError(f"target has {name!r}, and indices have no derivative; compare 'depth', 'alpha' or 'color'")
-    target = as_mask(from_numbers(target, f"target[{name!r}]"))
-    shape = shape_of(target)
-    if shape[:2] != size or len(shape) not in (2, 3):
-        height, width = size
-        raise InputError(
-            f"target[{name!r}] {described(target)}; expected real numbers ({height}, {width}) or ({height}, {width}, ·)"
-        )
-    check_floating(f"target[{name!r}]", target)
-    _check_finite(f"target[{name!r}]", target, NOT_MEASURED if name in ZERO_UNMEASURED else NOTHING_THERE)
-    count = shape[2] if len(shape) > 2 else 1
-    if name == "alpha" or (name == "color" and count == channels == 3):  # Four numbers may be features.
-        check_range(target, count, channels, f"target[{name!r}]")
-    return target
-
-
-def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
-    if weights is None:
-        return None
-    weights = as_mask(from_numbers(np.full(size, weights, np.float32) if is_real(weights) else weights, "weights"))
-    allowed = dict.fromkeys((size, (*size, 1), tuple(shape)))
-    if shape_of(weights) not in allowed:
-        raise InputError(f"weights {described(weights)}; expected {' or '.join(map(str, allowed))}")
-    check_floating("weights", weights)
-    _check_finite("weights", weights)
-    if (least := -largest(-weights)) < 0:
-        raise InputError(f"weights go down to {least:g}; expected none below zero: only their squares count")
-    return weights
-
-
-def _check_finite(name: str, value: Array, hint: str = "") -> None:
-    """Refuse NaN and infinity, where values are known; a hint says what to do."""
-    if not is_finite(value):
-        raise InputError(f"{name} holds NaN or infinity; expected finite numbers{hint}")

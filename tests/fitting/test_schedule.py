@@ -8,8 +8,8 @@ from helpers import DIFFERENTIABLE, arrays, box, quad, to_numpy
 
 import rts
 from rts.errors import InputError
-from rts.fitting.image_residuals import _shrunk
 from rts.fitting.schedule import blurred, box_filtered
+from rts.fitting.targets import shrunk
 
 pytestmark = pytest.mark.fitting
 
@@ -91,7 +91,7 @@ def test_weighted_targets_keep_the_sum_of_squares_but_for_a_constant(target):
     rng = np.random.default_rng(2)
     goal, weights = rng.random((12, 10, 3)), rng.random((12, 10)) * (rng.random((12, 10)) > 0.3)
     weights[:3, :5] = 0
-    small, factors = map(to_numpy, _shrunk(arrays(target, goal), arrays(target, weights), (4, 2)))
+    small, factors = map(to_numpy, shrunk(arrays(target, goal), arrays(target, weights), (4, 2)))
     assert small.shape == (4, 2, 3) and factors.shape == (4, 2) and factors[0, 0] == 0
     assert np.isfinite(small).all()
 
