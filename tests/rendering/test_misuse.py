@@ -310,8 +310,8 @@ NUMBERS = """
     shader.specular shader.shininess shader.ambient look_at.fov_y look_at.aspect look_at.near look_at.far
     orthographic.height from_opencv.near from_opencv.pixel_center from_pytorch3d.focal_length from_blender.focal
     splatter.sigma splatter.calibration exact_calibration.sigma save_animation.fps fit.learning_rate fit.tolerance
-    ImageResiduals.f_scale gradient_image.scale Bezier.tolerance tessellate.rate Isosurface.isovalue
-    Isosurface.lipschitz Sdf.radius Sdf.lipschitz NarrowBand.lipschitz Stage.sigma
+    ImageResiduals.weights ImageResiduals.f_scale gradient_image.scale Bezier.tolerance tessellate.rate
+    Isosurface.isovalue Isosurface.lipschitz Sdf.radius Sdf.lipschitz NarrowBand.lipschitz Stage.sigma
 """
 ACCEPTED = {
     "None": OPTIONAL.split(),
