@@ -142,14 +142,19 @@ def _divide_pull(start, stop, image, g, first, least, g_image):
 
 
 @compiled
+def _inverse_length(x, y, z):
+    """One over the length of a vector; 1 for that of zero."""
+    square = x * x + y * y + z * z
+    return 1 / math.sqrt(square) if square > 0 else 1.0
+
+
+@compiled
 def _scale(start, stop, image, first, least, out):
     """Fill rows [start, stop) of `out` (P, 3) with three channels of `image` (P, C + 1), scaled to length one."""
     last = image.shape[1] - 1
     for p in range(start, stop):
         x, y, z = np.float64(image[p, first]), np.float64(image[p, first + 1]), np.float64(image[p, first + 2])
-        square = x * x + y * y + z * z
-        scale = 1 / math.sqrt(square) if square > 0 else 1.0
-        scale = scale if image[p, last] >= least else 0.0
+        scale = _inverse_length(x, y, z) if image[p, last] >= least else 0.0
         out[p, 0], out[p, 1], out[p, 2] = scale * x, scale * y, scale * z
 
 
@@ -159,9 +164,7 @@ def _scale_push(start, stop, image, t, first, least, out):
     last = image.shape[1] - 1
     for p in range(start, stop):
         x, y, z = np.float64(image[p, first]), np.float64(image[p, first + 1]), np.float64(image[p, first + 2])
-        square = x * x + y * y + z * z
-        scale = 1 / math.sqrt(square) if square > 0 else 1.0
-        scale = scale if image[p, last] >= least else 0.0
+        scale = _inverse_length(x, y, z) if image[p, last] >= least else 0.0
         along = x * t[p, first] + y * t[p, first + 1] + z * t[p, first + 2]
         along *= scale * scale
         out[p, 0] = scale * (t[p, first] - along * x)
@@ -175,9 +178,7 @@ def _scale_pull(start, stop, image, g, first, least, g_image):
     last = image.shape[1] - 1
     for p in range(start, stop):
         x, y, z = np.float64(image[p, first]), np.float64(image[p, first + 1]), np.float64(image[p, first + 2])
-        square = x * x + y * y + z * z
-        scale = 1 / math.sqrt(square) if square > 0 else 1.0
-        scale = scale if image[p, last] >= least else 0.0
+        scale = _inverse_length(x, y, z) if image[p, last] >= least else 0.0
         along = scale * scale * (x * g[p, 0] + y * g[p, 1] + z * g[p, 2])
         g_image[p, first] += scale * (g[p, 0] - along * x)
         g_image[p, first + 1] += scale * (g[p, 1] - along * y)
