@@ -259,7 +259,10 @@ def _level(a: Fronts, b: Fronts, oracle: Oracle) -> np.ndarray:
 
 
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals halved until they are `FINE`; a half whose ends see the same surfaces is dropped."""
+    """Intervals halved until they are `FINE`; a half whose ends see the same surfaces is dropped.
+
+    A scene is sampled for two halvings at once: fewer calls cost less than the samples that prove to be of no use.
+    """
     finished = []
     while True:
         fine = found.high - found.low <= FINE
@@ -267,19 +270,33 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         found = found.at(np.flatnonzero(~fine))
         if not len(found.gap):
             break
-        middle = (found.low + found.high) / 2
-        in_middle = oracle.layers(gaps.points(found.gap, middle))
-        halves = [
-            _Intervals(found.gap, found.low, middle, found.before, in_middle),
-            _Intervals(found.gap, middle, found.high, in_middle, found.behind),
-        ]
-        # Within the same parts the half in which a depth changes more has the break.
-        alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
-        changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
-        drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
-        drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
-        found = _Intervals.of([half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)])
+        middle, quarter = (found.low + found.high) / 2, (found.high - found.low) / 4
+        places = middle - quarter, middle, middle + quarter
+        gap = np.concatenate([found.gap] * len(places))
+        seen = oracle.layers(gaps.points(gap, np.concatenate(places)))
+        low, middle, high = np.arange(len(gap)).reshape(len(places), -1)
+        found, (first, second) = _halves(found, seen.at(middle), oracle)
+        found, _ = _halves(found, seen.at(np.concatenate([low[first], high[second]])), oracle)
     return _Intervals.of(finished)
+
+
+def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:
+    """Those halves of intervals in which a surface may end, all first ones before all second ones.
+
+    `in_middle` is what is seen in the middle of each interval. The second result are the intervals' indices, of both.
+    """
+    middle = (found.low + found.high) / 2
+    halves = [
+        _Intervals(found.gap, found.low, middle, found.before, in_middle),
+        _Intervals(found.gap, middle, found.high, in_middle, found.behind),
+    ]
+    # Within the same parts the half in which a depth changes more has the break.
+    alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
+    changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
+    drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
+    drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
+    kept = [np.flatnonzero(~d) for d in drop]
+    return _Intervals.of([half.at(index) for half, index in zip(halves, kept, strict=True)]), kept
 
 
 class _Change(NamedTuple):

@@ -157,10 +157,12 @@ def _cast_some(
         further = going.further(t, value)
         after = free(going.at(further))
         crossed = on & _change_sign(value, after)
-        cell, bracket = _rows((hits * count + index, _Bracket(t, further, value, after)), xp.nonzero(crossed)[0])
-        cells.append(cell)
-        brackets.append(bracket)
-        hits = hits + xp.astype(crossed, xp.int64)
+        at = xp.nonzero(crossed)[0]
+        if at.shape[0]:
+            cell, bracket = _rows((hits * count + index, _Bracket(t, further, value, after)), at)
+            cells.append(cell)
+            brackets.append(bracket)
+            hits = hits + xp.astype(crossed, xp.int64)
         t, value = further, after
     cell, bracket = xp.concat(cells), _Bracket(*(xp.concat(x) for x in zip(*brackets, strict=True)))
     met = _rows(rays, cell % count)
