@@ -40,7 +40,7 @@ test-xla: warmup
 
 # Distributions of their own that are built on the library, each with its tests.
 apps: warmup $(VENV)/.apps
-	@for app in $(APPS); do echo "== $$app"; $(BIN)/python -m pytest $$app/tests || exit 1; done
+	@for app in $(APPS); do echo "== $$app"; $(PYTEST) $$app/tests || exit 1; done
 
 # The site, in build/site: tutorials are executed, and every warning and every dead link is an error. RTS_QUICK=1 makes
 # the pictures of tutorials small. Tutorials write pictures into the folder that they run in.

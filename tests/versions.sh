@@ -6,8 +6,9 @@
 #     tests/versions.sh newest   # whatever the package index has
 #
 # Variables: PYTHON, the interpreter (python3); VENV, the environment (.venv-SET); TORCH, a version of torch in place of
-# the set's; WORKERS (2); MARKS, the tests ("engines or files", those that would notice). Torch of the index brings
-# gigabytes of CUDA, unless PIP_EXTRA_INDEX_URL names an index of builds without.
+# the set's; WORKERS (2); MARKS, the tests (quick ones of engines and files, which would notice; "engines or files" adds
+# those that compile long). Torch of the index brings gigabytes of CUDA, unless PIP_EXTRA_INDEX_URL names an index of
+# builds without.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 set_=${1:?expected oldest, pinned or newest}
@@ -49,7 +50,7 @@ assert all(p.ready for p in rts.plugins("engines", details=True))
 PYTHON
 NUMBA_CACHE_DIR=$(realpath "$venv")/numba
 export NUMBA_CACHE_DIR
-"$bin/python" -m pytest -n "${WORKERS:-2}" --dist loadfile -p no:cacheprovider -m "${MARKS:-engines or files}"
+"$bin/python" -m pytest -n "${WORKERS:-2}" --dist loadfile -p no:cacheprovider -m "${MARKS:-(engines or files) and not thorough}"
 # A pose's fit, from far off: found, in torch and in jax.
 for engine in torch jax; do
     "$bin/python" -m rts demo -o "$venv/demo-$engine" --engine "$engine"

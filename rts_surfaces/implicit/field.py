@@ -90,6 +90,7 @@ class Field(ScalarField):
         self.f, self.isovalue, self.inside, self.sign = f, value, inside, SIDES[inside]
         self.name = getattr(f, "__name__", type(f).__name__)
         self._reads = None if reads is None else tuple(reads)
+        self._room: Callable[[int], int] | None = None
 
     def __repr__(self) -> str:
         return f"Field({self.name}, {self.isovalue:g}, {self.inside!r})"
@@ -112,7 +113,7 @@ class Field(ScalarField):
                 accepted for float64 points.
         """
         try:
-            value = self.f(theta, points)
+            value = self._value(theta, points)
         except KeyError as error:
             raise InputError(f"{self.name} finds no {error}; theta has {sorted(theta)}") from error
         except (AttributeError, TypeError, ValueError, IndexError, RuntimeError) as error:
@@ -123,6 +124,25 @@ class Field(ScalarField):
             value = np.asarray(value, points.dtype)  # Differences for slopes are taken in float64.
         check_result("f", value, points)
         return self.sign * (value - self.isovalue)
+
+    def _value(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The values (M,) of `f`.
+
+        Some functions give arrays of another engine for points of NumPy, such as those that are written with jax.numpy.
+        Where that engine compiles operations for each shape, they get points of few shapes: padded by the first one.
+        """
+        count = points.shape[0]
+        if self._room is None or type(points) is not np.ndarray or not count:
+            value = self.f(theta, points)
+            if (
+                type(points) is np.ndarray
+                and hasattr(value, "dtype")
+                and not isinstance(value, (np.ndarray, np.generic))
+            ):
+                self._room = partial(engine_of(value).room, x=value)
+            return value
+        more = self._room(count) - count
+        return np.asarray(self.f(theta, np.concatenate([points, np.repeat(points[:1], more, axis=0)])))[:count]
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import elsewhere
 import numpy as np
 import pytest
-from example_surfaces import Torus
 from helpers import icosphere, relative_error, to_numpy
 
 import rts
@@ -178,8 +177,7 @@ CASES = {
     },
     "subdivision": lambda: Case((example("subdivision"),)),
     "isosurface": lambda: Case((example("isosurface"),)),
-    "sdf": lambda: Case((example("sdf"),)),
-    "rays": lambda: Case((rts.Part(Torus(), {"radii": np.array([0.9, 0.35])}, "normals"),), {"sampler": "rays"}),
+    "sdf": lambda: Case((rts.Part(rts.Sdf(field, 1.4), {"radius": np.array(0.9)}, "normals"),)),
     **{
         name: lambda name=name: Case((ball(),), {"splatter": name, "layers": 1 if name == "single" else 2})
         for name in ("none", "single", "multi", "edges")
@@ -251,7 +249,7 @@ def needed(name):
 
 # --------------------------------------------------------------------------------------------------------- images
 
-QUICK = ("mesh", "sdf", "lit texture", "environment", "mipmaps")
+QUICK = ("mesh", "lit texture", "environment", "mipmaps")
 """Cases for `make test`."""
 EVERY_CASE = [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES]
 
@@ -295,7 +293,7 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     tree = place.put(arrays_of(case))
     image, gradient, tangent = on_the_cpu(name)
     # Steps along rays, taken on the device, end where its rounding has them end.
-    exact = 1e-5 if name not in ("sdf", "rays") else 1e-4
+    exact = 1e-5 if name != "sdf" else 1e-4
     np.testing.assert_allclose(place.take(image_of(case, tree)), image, atol=exact)
     weights = place.put(WEIGHTS)
     elsewhere.copies.clear(), elsewhere.waits.clear()
@@ -303,7 +301,7 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     # The host gets inputs of samplers, and operands of operations that cross; loops along rays ask whether any goes on.
     assert elsewhere.copies or place.name != "torch-elsewhere"
     assert all(line.endswith((" to_host", " on_host")) for line in elsewhere.copies), elsewhere.copies
-    loops = ("_repeated", "_cast_some") if name in ("sdf", "rays") else ()
+    loops = ("_repeated", "_cast_some") if name == "sdf" else ()
     assert all(line.endswith(loops) for line in elsewhere.waits) if loops else not elsewhere.waits, elsewhere.waits
     assert abs(float(place.take(value)) - (image * WEIGHTS).sum()) < 1e-3
     scale = max(np.linalg.norm(x) for x in leaves(gradient))

@@ -127,7 +127,7 @@ def test_fragments_are_the_nearest_hits_of_each_ray(sampler, kind, camera):
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-@pytest.mark.parametrize("kind", quick(KINDS, 3))
+@pytest.mark.parametrize("kind", quick(KINDS))
 @pytest.mark.parametrize("name", ["raster", "reference", "embree"])
 def test_fragments_at_points_are_the_nearest_hits_of_their_rays(name, kind, camera):
     try:

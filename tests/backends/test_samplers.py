@@ -128,7 +128,7 @@ def expectation(path, view, cull):
 
 @pytest.mark.parametrize("cull", ["none", "back"])
 @pytest.mark.parametrize("view", ["perspective", "orthographic"])
-@pytest.mark.parametrize("mesh", MESHES)
+@pytest.mark.parametrize("mesh", quick(MESHES))
 def test_real_meshes_are_sampled_as_by_the_reference(sampler, mesh, view, cull, data):
     path = data / "meshes" / MESHES[mesh]
     vertices, faces, center, radius = real(path)

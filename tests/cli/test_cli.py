@@ -647,6 +647,7 @@ def patches(tmp_path):
     return path
 
 
+@pytest.mark.thorough
 def test_a_surface_of_patches_is_rendered_and_exported(patches, tmp_path):
     (part,) = rts.load(patches, surface="bezier")
     said = succeed("render", patches, "--surface", "bezier", "-o", tmp_path / "cap.png", "--up", "z", "--size", 64)

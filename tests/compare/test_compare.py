@@ -527,6 +527,7 @@ class TestTune:
         assert "sampler='raster': sampler='reference' takes 5 times as long" in told
         assert "supersample=" in told and "off by" in told
 
+    @pytest.mark.thorough
     def test_rates(self, modelled, kept):
         """A lattice that is finer than need be is thinned, and the scene that is given back has derivatives."""
         import torch

@@ -177,21 +177,21 @@ def silhouette(supersample):
     def moved(p):
         return part.replace(transform=rts.rigid(p))
 
-    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (128, 128), supersample=8)
+    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (64, 64), supersample=8)
     # Found outlines move smoothly: points and splats alone have a floor.
     options = {"splatter": "multi", "layers": 2, "supersample": supersample}
-    return rts.ImageResiduals(moved, camera, (128, 128), goal[..., 3], **options)
+    return rts.ImageResiduals(moved, camera, (64, 64), goal[..., 3], **options)
 
 
 @pytest.mark.thorough
 def test_the_floor_of_point_sampling_is_told_from_a_minimum():
     # From some starts the last gradient happens to promise nothing, and then it is called a minimum.
     point, told = silhouette(1), "no step lowers the loss: it is at the floor of point sampling; supersample=2, 3"
-    starts = [arrays("torch-cpu", 0.05 * np.random.default_rng(seed).normal(size=6)) for seed in range(6)]
+    starts = [arrays("torch-cpu", 0.05 * np.random.default_rng(seed).normal(size=6)) for seed in range(3)]
     fits = [rts.fit(point, start, method="lm", tolerance=0, steps=100) for start in starts]
     # Rounding decides whether a fit at the floor goes on by gains of a millionth.
     ended = [fit for fit in fits if len(fit.history) < 100]
-    assert len(ended) >= 3 and all(fit.reason.startswith("no step lowers the loss") for fit in ended)
+    assert len(ended) >= 2 and all(fit.reason.startswith("no step lowers the loss") for fit in ended)
     start, coarse = next((start, fit) for start, fit in zip(starts, fits, strict=True) if fit.reason.startswith(told))
     finer = rts.fit(silhouette(3), start, method="lm", tolerance=0, steps=300)
     assert finer.loss < coarse.loss / 4

@@ -107,7 +107,7 @@ def coverage(f, eye, way, **more):
     return image
 
 
-@pytest.mark.parametrize("way", quick(list(WAYS), 3))
+@pytest.mark.parametrize("way", quick(["lattice", "sdf", "rays", "edge", "band"], 2))
 @pytest.mark.parametrize("name", SHAPES)
 def test_areas_of_outlines_grow_as_closed_forms_say(name, way):
     torch = pytest.importorskip("torch")
@@ -117,8 +117,8 @@ def test_areas_of_outlines_grow_as_closed_forms_say(name, way):
     np.testing.assert_allclose(found, expected(q), rtol=0.02, atol=0.02 * max(map(abs, expected(q))))
 
 
-@pytest.mark.parametrize("way", quick(["sdf", "lattice", "edge", "rays", "band"], 2))
-@pytest.mark.parametrize("name", ["ball", "torus across", "box, turned"])
+@pytest.mark.parametrize("way", quick(["lattice", "sdf", "edge", "rays", "band"]))
+@pytest.mark.parametrize("name", ["torus across", "box, turned"])
 def test_outlines_shift_with_the_surface(name, way):
     """As x shifts by one unit, the sum of x · α grows by the area; and nothing grows."""
     torch = pytest.importorskip("torch")
@@ -138,8 +138,10 @@ def test_outlines_shift_with_the_surface(name, way):
 @pytest.mark.parametrize("way", ["sdf", "lattice"])
 def test_a_compiled_program_has_the_derivative_of_an_eager_one(way):
     jax = pytest.importorskip("jax")
-    f, q, eye, _ = SHAPES["torus across"]
-    image, q, shift = coverage(f, eye, way, layers=2), jax.numpy.asarray(q), jax.numpy.full(3, SHIFT)
+    # Programs of rays compile long.
+    name, layers = ("ball", 1) if way == "sdf" else ("torus across", 2)
+    f, q, eye, _ = SHAPES[name]
+    image, q, shift = coverage(f, eye, way, layers=layers), jax.numpy.asarray(q), jax.numpy.full(3, SHIFT)
     gradient = jax.grad(lambda q: (image(q, shift) * jax.numpy.arange(SIZE[1])).sum())
     np.testing.assert_allclose(jax.jit(gradient)(q), gradient(q), rtol=1e-3)
 
@@ -216,7 +218,7 @@ def paired(name, way):
     return found.outlines, places[np.maximum(found.outlines.pair, 0)], places
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", quick(list(WAYS), 4))
 def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     outlines, pairs, places = paired("torus across", way)
     there, index = outlines.pair[:, 0] >= 0, np.arange(len(outlines.near))

@@ -200,6 +200,7 @@ def test_a_table_has_each_lattice_point_once():
     np.testing.assert_array_equal(points[samples.ids], plain.ids)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
     jax = pytest.importorskip("jax")
@@ -246,7 +247,7 @@ def glass(theta, gbuffer, camera):
 
 
 @pytest.mark.parametrize("shader", ["normals", glass], ids=["opaque", "glass"])
-@pytest.mark.parametrize("target", [*ALL, "jax.jit"])
+@pytest.mark.parametrize("target", ["numpy", "torch-cpu", "jax.jit"])
 def test_samples_beside_outlines_are_joined_to_tables(target, shader):
     """Two parts, each with a table, alone and in two views: images and gradients are those without tables."""
     engine, weights = target.removesuffix(".jit"), np.random.default_rng(0).random((*SIZE, 4), np.float32)

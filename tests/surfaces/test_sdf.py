@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, quick, to_numpy
 from test_torus import RADII, closed_form, some_rays
 
 import rts
@@ -357,7 +357,7 @@ def test_pictures_of_torch_are_the_same_in_every_mode_and_require_no_gradient():
             assert torch.equal(rts.render(still, camera, (20, 24)), image)
 
 
-@pytest.mark.parametrize("grad", [True, False])
+@pytest.mark.parametrize("grad", quick([False, True]))
 def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, grad):
     torch = pytest.importorskip("torch")
     part, camera = rts.Sdf.example(), rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
@@ -374,3 +374,30 @@ def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, gr
     if grad:
         slopes = [torch.autograd.grad((x * x).mean(), r)[0] for x, r in ((whole, radii), (banded, other))]
         assert torch.allclose(*slopes, rtol=2e-3) and slopes[0].abs().min() > 1e-4
+
+
+def test_a_function_of_jax_alone_is_called_with_few_shapes():
+    """It is compiled for each; its image is that of array code for any engine, in a compiled program and out of it."""
+    jax = pytest.importorskip("jax")
+    shapes = set()
+
+    def field(theta, points):
+        shapes.add(points.shape)
+        return jax.numpy.sqrt((points * points).sum(axis=1) + 1e-12) - theta["radius"]
+
+    def same(theta, points):
+        xp = rts.namespace(points)
+        return xp.sqrt(xp.sum(points * points, axis=1) + 1e-12) - theta["radius"]
+
+    def image(f):
+        camera = rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
+        return lambda radius: rts.render(rts.Part(rts.Sdf(f, 1.2), {"radius": radius}, "normals"), camera, (20, 24))
+
+    radius, one = jax.numpy.float32(0.9), jax.numpy.float32(1)
+    expected = [np.asarray(x) for x in jax.jvp(image(same), (radius,), (one,))]
+    for way in (image(field), jax.jit(image(field))):
+        shapes.clear()
+        for mine, other in zip(jax.jvp(way, (radius,), (one,)), expected, strict=True):
+            # Slopes of the function are differences of its values, which are of single precision.
+            assert np.linalg.norm(np.asarray(mine) - other) < 5e-3 * np.linalg.norm(other)
+        assert len(shapes) < 10

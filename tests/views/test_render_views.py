@@ -108,6 +108,7 @@ def test_derivatives_along_cameras_and_poses_are_those_of_a_loop_but_for_roundin
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
 
 
+@pytest.mark.thorough
 def test_numpy_scenes_whose_shaders_hold_traced_arrays_are_differentiated():
     jax = pytest.importorskip("jax")
 
