@@ -54,9 +54,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         ]
         inputs = stopped((known, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
-    # Points are sampled step by step: too many shapes for an engine that compiles eager operations for each.
-    stepwise = engine_of(sampled.row).padded(sampled.row) and not all(map(has_sheets, scene.parts, scene.samplers))
-    if traced or stepwise or any(map(is_batched, leaves(inputs))):
+    if traced or any(map(is_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:

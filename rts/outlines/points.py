@@ -164,7 +164,7 @@ class Points:
             fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None
             more = self.sample(index, points[ending], fragments, pairs=True)
             if more.pair is not None:
-                found = host_value(more.pair).T
+                found = host_value(more.pair).T[: len(at)]
                 rows[at] = np.where(found >= 0, found + samples[index].ids.shape[-2], -1)
             samples[index] = in_one_table([samples[index], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
@@ -234,6 +234,11 @@ class Points:
         if fragments is not None and plain and not pairs and not self._scene.context.engine.differentiates:
             # What a call of the sampler comes to.
             return pack_fragments(fragments, entry.proxy).replace(gbuffer_names=checked.reads, at_points=True)
+        if fragments is None and len(points):
+            # Engines that compile eager operations for each shape get few: further rows repeat the first point.
+            arrays = checked.theta, camera
+            more = engine_of(*arrays).room(len(points), exemplar(*arrays)) - len(points)
+            points = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
         if not len(points) and (sheets is None or _refines(checked)):
             # Surfaces may want a ray at least; nothing names its sample.
             points, fragments = np.full((1, 2), 0.5), None
@@ -262,12 +267,9 @@ class Points:
     def _layers(self, points: np.ndarray, count: int) -> Fronts:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
         scene, none = self._scene, (count, len(points))
-        arrays = [part.theta for part in scene.parts], self._grid.camera
-        more = engine_of(*arrays).room(len(points), exemplar(*arrays)) - len(points)
-        padded = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
         part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
         for index, opaque in enumerate(scene.opaque):
-            samples = self.sample(index, padded, layers=1 if opaque else count)
+            samples = self.sample(index, points, layers=1 if opaque else count)
             row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
             part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])

@@ -6,11 +6,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rts import engine_of, namespace
-from rts.plugin_api.arrays import Array, map_leaves
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts.plugin_api.operations import gradient
-from rts.plugin_api.records import RayHits
+from rts.plugin_api.records import ArraySpec, RayHits
 from rts_surfaces.implicit.regions import Region
+
+Level = Callable[[Tree, Array], Array]
+Describe = Callable[[Tree, Array, Array], Array]
 
 STEPS, WITH_BOUND = 256, 512
 """The number of shortest steps across the region, without and with a Lipschitz constant."""
@@ -55,8 +60,9 @@ def per_level(slope: Array, hit: Array) -> Array:
 
 
 def cast(
-    level: Callable[[Array], Array],
-    describe: Callable[[Array, Array], Array],
+    level: Level,
+    describe: Describe,
+    theta: Tree,
     origins: Array,
     directions: Array,
     layers: int,
@@ -69,10 +75,12 @@ def cast(
 
     With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
     lead over the surface. Without L all steps are of one length. In both cases parts thinner than a step may be missed.
+    For an engine that compiles eager operations for each shape, NumPy casts the rays, and hits alone are described.
 
     Args:
-        level: points (M, 3) → (M,), negative inside, zero counts as outside.
-        describe: a function of points (M, 3) and marks (M,) bool of those on the surface; gives parameters (M, P).
+        level: θ and points (M, 3) → (M,), negative inside, zero counts as outside.
+        describe: a function of θ, points (M, 3) and marks (M,) bool of those on the surface; gives parameters (M, P).
+        theta: θ, constant.
         origins: (R, 3).
         directions: (R, 3), of any length but zero.
         layers: K.
@@ -85,6 +93,9 @@ def cast(
     """
     engine = engine_of(origins)
     xp = engine.namespace
+    if engine.room(1, origins) > 1:
+        options = {"within": within, "lipschitz": lipschitz, "steps": steps}
+        return _cast_on_host(level, describe, theta, origins, directions, layers, options)
     length = xp.sqrt(xp.sum(directions * directions, axis=-1))
     enter, leave = within.span(origins, directions)
     if steps is None:
@@ -97,10 +108,32 @@ def cast(
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
     most = steps + 1  # The shortest steps need no more to cross the region.
-    free = partial(without_derivative, level)
+    at, described = partial(level, theta), partial(describe, theta)
+    free = partial(without_derivative, at)
     if engine.padded(origins):
-        return _cast_all(level, free, describe, rays, enter, layers, most)
-    return _cast_some(level, free, describe, rays, enter, layers, most)
+        return _cast_all(at, free, described, rays, enter, layers, most)
+    return _cast_some(at, free, described, rays, enter, layers, most)
+
+
+def _cast_on_host(
+    level: Level, describe: Describe, theta: Tree, origins: Array, directions: Array, layers: int, options: dict
+) -> RayHits:
+    """See `cast`: NumPy finds the hits, the engine their parameters."""
+    engine, count = engine_of(origins), origins.shape[0]
+
+    def found(origins: np.ndarray, directions: np.ndarray, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        values = iter(arrays)
+        known = map_leaves(lambda _: next(values), theta)
+        hits = cast(level, lambda _, points, hit: points[:, :0], known, origins, directions, layers, **options)
+        return hits.hit, hits.distance, hits.entering
+
+    specs = [ArraySpec((layers, count), dtype) for dtype in (bool, np.dtype(str(origins.dtype)), bool)]
+    hit, distance, entering = engine.call_host(found, specs, origins, directions, *leaves(theta))
+    xp = engine.namespace
+    points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
+    params = describe(theta, points, xp.reshape(hit, (-1,)))
+    params = xp.where(hit[..., None], xp.reshape(params, (layers, count, params.shape[-1])), 0.0)
+    return RayHits(hit, distance, params, entering=entering)
 
 
 class _Rays(NamedTuple):

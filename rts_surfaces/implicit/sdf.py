@@ -84,10 +84,11 @@ class Sdf(Implicit, RaySurface):
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
         """The nearest hits within the ball, in θ's dtype; see `rts.RaySurface`."""
-        level = partial(self.field.level, theta)
+        level = self.field.level
         return cast(
             level,
-            partial(moving, level),
+            lambda theta, points, hit: moving(partial(level, theta), points, hit),
+            theta,
             self.field.in_theta_dtype(theta, origins),
             self.field.in_theta_dtype(theta, directions),
             layers,

@@ -112,20 +112,15 @@ def test_rays_are_clipped_to_boxes_as_to_balls():
     directions[0] *= (1, 0, 1)
     origins[1], directions[1] = (0, 5, 0), (0, -1, 0)
 
-    def level(p):
-        return swept_sphere({"radii": RADII}, p)
-
     low, high = np.array([-1.26, -0.36, -1.26]), np.array([1.26, 0.36, 1.26])
     for engine in ALL:
-        rays = arrays(engine, (origins, directions))
-        if engine != "numpy":
-            theta = arrays(engine, {"radii": RADII})
+        rays, theta = arrays(engine, (origins, directions)), arrays(engine, {"radii": RADII})
 
-            def level(p, theta=theta):
-                return swept_sphere(theta, p)
+        def described(theta, points, hit):
+            return moving(lambda p: swept_sphere(theta, p), points, hit)
 
         pair = [
-            cast(level, lambda p, hit, f=level: moving(f, p, hit), *rays, 4, within=within, lipschitz=1.0)
+            cast(swept_sphere, described, theta, *rays, 4, within=within, lipschitz=1.0)
             for within in (ball(np.zeros(3), 1.3), box(low, high))
         ]
         first, second = ([to_numpy(x) for x in hits[:2]] for hits in pair)
