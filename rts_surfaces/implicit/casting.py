@@ -121,7 +121,7 @@ def _cast_on_host(
     """See `cast`: NumPy finds the hits, the engine their parameters."""
     engine, count = engine_of(origins), origins.shape[0]
 
-    def found(origins: np.ndarray, directions: np.ndarray, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    def found(origins: np.ndarray, directions: np.ndarray, *arrays: np.ndarray) -> tuple[Any, ...]:
         values = iter(arrays)
         known = map_leaves(lambda _: next(values), theta)
         hits = cast(level, lambda _, points, hit: points[:, :0], known, origins, directions, layers, **options)

@@ -19,6 +19,8 @@ from rts_robot.uncertainty import covariance_of
 
 COARSE, MIDDLE, FULL = rts.Stage(1 / 8, 2, 2.0), rts.Stage(1 / 4), rts.Stage()
 """Stages of a fit: that of each start, and those of the best."""
+TRIES, FOUND = 4, 0.6
+"""The most searches for a start, each with a seed of its own; and the mean IoU above which none follows."""
 LIMITS = {COARSE: (3e-3, 20), MIDDLE: (1e-3, 20), FULL: (1e-5, 8)}
 """For each stage, the least gain of a step, as a share of the loss, which is mostly that of wrong pixels; and the most
 steps. Further ones moved the camera by less than a tenth of its standard deviation."""
@@ -110,15 +112,9 @@ def calibrate(
     robust = rts.Loss(loss) if loss == "linear" else rts.Loss(loss, 0.5 if f_scale is None else f_scale)
     rts.Camera.from_opencv(intrinsics, np.eye(3), np.zeros(3), size)  # Refused before any work.
     intrinsics = np.asarray(intrinsics, np.float64)
-    if start is None:
-        starts = find_starts(robot, values, masks, intrinsics, seed=seed)
-    else:
+    if start is not None:
         check_numbers("start", start, (4, 4))
-        starts = [np.linalg.inv(np.asarray(start, np.float64))]
-    problems = [_Problem(robot, masks, values, intrinsics, view, (), robust, apart=True) for view in starts]
-    fits = [problem.fitted(COARSE, progress) for problem in problems]
-    best = min(range(len(fits)), key=lambda n: fits[n].loss)
-    view = problems[best].view_at(fits[best].parameters)
+    view = _roughly(robot, masks, values, intrinsics, start, robust, seed, progress)
     problem = _Problem(robot, masks, values, intrinsics, view, offsets, robust)
     fit = problem.fitted(FULL, progress, problem.fitted(MIDDLE, progress).parameters)
     view = problem.view_at(fit.parameters)
@@ -127,7 +123,7 @@ def calibrate(
     final = _Problem(robot, masks, moved, intrinsics, view, offsets, robust)
     covariance, camera = final.covariance(), final.camera
     deviations = np.sqrt(np.diag(covariance)[6:])
-    ious = np.array([_iou(robot.silhouette(q), camera, mask) for q, mask in zip(moved, masks, strict=True)])
+    ious = _ious(robot, moved, camera, masks)
     return Calibration(
         np.linalg.inv(view),
         covariance[:6, :6],
@@ -140,6 +136,34 @@ def calibrate(
         camera,
         moved,
     )
+
+
+def _roughly(
+    robot: Robot,
+    masks: np.ndarray,
+    values: np.ndarray,
+    intrinsics: np.ndarray,
+    start: Any,
+    loss: rts.Loss,
+    seed: int,
+    progress: bool | None,
+) -> np.ndarray:
+    """Camera-from-base (4, 4) after the coarse stage, from a start or from the best of those that are searched for."""
+    fits: list[tuple[float, np.ndarray]] = []
+    for number in range(TRIES):
+        if start is None:
+            starts = find_starts(robot, values, masks, intrinsics, seed=seed + number)
+        else:
+            starts = [np.linalg.inv(np.asarray(start, np.float64))]
+        for view in starts:
+            problem = _Problem(robot, masks, values, intrinsics, view, (), loss, apart=True)
+            fit = problem.fitted(COARSE, progress)
+            fits.append((fit.loss, problem.view_at(fit.parameters)))
+        _, best = min(fits, key=lambda fit: fit[0])
+        camera = _Problem(robot, masks, values, intrinsics, best, (), loss).camera
+        if start is not None or _ious(robot, values, camera, masks).mean() > FOUND:
+            return best
+    return min(fits, key=lambda fit: fit[0])[1]
 
 
 class _Problem:
@@ -226,6 +250,11 @@ class _Problem:
         change[:6, :6] = -np.eye(6)
         change[3:6, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
         return change @ covariance @ change.T
+
+
+def _ious(robot: Robot, values: np.ndarray, camera: rts.Camera, masks: np.ndarray) -> np.ndarray:
+    """The intersection over union (B,) of the robot and the mask of each view."""
+    return np.array([_iou(robot.silhouette(q), camera, mask) for q, mask in zip(values, masks, strict=True)])
 
 
 def _iou(part: rts.Part, camera: rts.Camera, mask: np.ndarray) -> float:
