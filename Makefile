@@ -36,7 +36,7 @@ test-all: warmup
 
 # jax as users have it: XLA improves programs, which elsewhere in the tests would take longer than it saves.
 test-xla: warmup
-	XLA_FLAGS= $(PYTEST) tests/backends/test_jax.py
+	XLA_FLAGS= $(PYTEST) --dist load tests/backends/test_jax.py
 
 # Distributions of their own that are built on the library, each with its tests.
 apps: warmup $(VENV)/.apps

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import CAMERA, JOINTS, SIZE, VALUES, area_masks, written
 from PIL import Image
-from rts_robot import calibrate, load_urdf
+from rts_robot import calibrate, calibration, load_urdf
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -44,6 +44,21 @@ def test_a_camera_is_found_without_a_start_to_within_its_deviations(robot, masks
     assert off @ np.linalg.solve(found.covariance, off) < 22.5  # χ² of six numbers: 99.9 %.
     assert found.deviations[3:].max() < 5e-3 and not found.offsets
     np.testing.assert_allclose(found.camera.view, CAMERA.view, atol=0.01)
+
+
+@pytest.mark.thorough
+def test_another_search_follows_where_the_robot_does_not_fit_the_masks(robot, masks, monkeypatch):
+    searches = []
+
+    def starts(*_, seed):
+        searches.append(seed)
+        around = [0.02, -0.01, 0.01] if seed == 6 else [0, 0, 2.5]
+        return [np.linalg.inv(np.asarray(rts.rigid([*around, 0.02, -0.01, 0.01])) @ TRUE)]
+
+    monkeypatch.setattr(calibration, "find_starts", starts)
+    found = calibrate(robot, masks, VALUES, INTRINSICS, seed=5, progress=False)
+    assert searches == [5, 6] and found.ious.min() > 0.85
+    assert np.linalg.norm(error(found)[3:]) < 5e-3
 
 
 @pytest.mark.thorough
