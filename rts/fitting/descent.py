@@ -179,10 +179,10 @@ def checked_rates(learning_rate: Any, method: Any, names: Sequence[str]) -> floa
         return 0.0
     if learning_rate is None:
         return LEARNING_RATES.get(method, 0.0)
+    if method == "lm":
+        raise InputError('learning_rate is given, and method "lm" has none; leave it out')
     if not isinstance(learning_rate, dict):
         return _checked_rate("learning_rate", learning_rate)
-    if method == "lm":
-        raise InputError('learning_rate is a mapping, and method "lm" has no rates; leave it out')
     rates: dict[str, float] = {}
     for key in sorted(learning_rate, key=lambda key: len(str(key))):  # The longer, the more particular.
         named = [name for name in names if name == key or name.startswith(f"{key}.")]
