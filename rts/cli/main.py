@@ -27,6 +27,7 @@ from rts.cli.options import (
     is_given,
     layers_of,
     refuse_beside,
+    refuse_without_light,
     sunlight,
     view_of,
 )
@@ -204,6 +205,7 @@ def render(
     if exposure is not None and output.suffix.lower() != ".png":
         raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
     check_exposure(exposure or 0.0)
+    refuse_without_light({"--shadows": shadows, "--environment": environment}, shader)
     light: Any = None if environment is None else {"environment": environment_of(environment, up)}
     engine_object = registry.plugin("rts.engines", engine)()
     own_light = environment is None and not shadows

@@ -83,6 +83,16 @@ def refuse_beside(option: str, context: typer.Context, others: Sequence[str]) ->
             raise typer.BadParameter(f"--{other} beside {option}, which says it already; leave one of them out")
 
 
+def refuse_without_light(options: dict[str, Any], shader: str) -> None:
+    """Refuse options that set the light, those whose value is true, beside a shader that no light falls on."""
+    from rts import registry
+
+    given = [option for option, value in options.items() if value]
+    reads = None if shader == "auto" or not given else registry.plugin("rts.shaders", shader)().reads
+    if reads is not None and "light" not in reads:
+        raise typer.BadParameter(f"{given[0]} sets the light, and the shader {shader} has none; try lambert or pbr")
+
+
 SurfaceName = Annotated[
     str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
 ]

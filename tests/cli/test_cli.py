@@ -291,6 +291,12 @@ def test_render_casts_shadows(tmp_path):
     assert darker.min() > -0.01 and 0.005 < (darker > 0.3).mean() < 0.05
 
 
+@pytest.mark.parametrize("option", [["--shadows"], ["--environment", "sky.hdr"]])
+def test_light_beside_a_shader_without_is_refused(model, option):
+    told = fail("render", model, "-o", "a.png", "--shader", "silhouette", *option, code=2)
+    assert f"{option[0]} sets the light, and the shader silhouette has none; try lambert or pbr" in told
+
+
 def test_render_options_reach_the_picture(model, tmp_path):
     def picture(*options):
         succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, *options)
