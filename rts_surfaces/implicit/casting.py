@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts import engine_of, namespace
-from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts.plugin_api.arrays import Array, Tree, map_leaves
 from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import ArraySpec, RayHits
 from rts_surfaces.implicit.regions import Region
@@ -75,7 +76,8 @@ def cast(
 
     With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
     lead over the surface. Without L all steps are of one length. In both cases parts thinner than a step may be missed.
-    For an engine that compiles eager operations for each shape, NumPy casts the rays, and hits alone are described.
+    Where an engine of the CPU compiles eager operations for each shape, NumPy takes the steps, and the engine computes
+    levels, of few shapes, and parameters.
 
     Args:
         level: θ and points (M, 3) → (M,), negative inside, zero counts as outside.
@@ -93,9 +95,10 @@ def cast(
     """
     engine = engine_of(origins)
     xp = engine.namespace
-    if engine.room(1, origins) > 1:
+    if engine.room(1, origins) > 1 and engine.on_host(origins) and origins.shape[0]:
         options = {"within": within, "lipschitz": lipschitz, "steps": steps}
-        return _cast_on_host(level, describe, theta, origins, directions, layers, options)
+        with suppress(_Unknown):
+            return _cast_on_host(level, describe, theta, origins, directions, layers, options)
     length = xp.sqrt(xp.sum(directions * directions, axis=-1))
     enter, leave = within.span(origins, directions)
     if steps is None:
@@ -115,24 +118,40 @@ def cast(
     return _cast_some(at, free, described, rays, enter, layers, most)
 
 
+class _Unknown(Exception):
+    """A level is traced, though rays are known, as under an eager `vmap` over θ."""
+
+
 def _cast_on_host(
     level: Level, describe: Describe, theta: Tree, origins: Array, directions: Array, layers: int, options: dict
 ) -> RayHits:
-    """See `cast`: NumPy finds the hits, the engine their parameters."""
-    engine, count = engine_of(origins), origins.shape[0]
+    """See `cast`: NumPy takes the steps.
 
-    def found(origins: np.ndarray, directions: np.ndarray, *arrays: np.ndarray) -> tuple[Any, ...]:
-        values = iter(arrays)
-        known = map_leaves(lambda _: next(values), theta)
-        hits = cast(level, lambda _, points, hit: points[:, :0], known, origins, directions, layers, **options)
+    Raises:
+        _Unknown: the level is traced.
+    """
+    engine = engine_of(origins)
+
+    def known(_: Tree, points: np.ndarray) -> np.ndarray:
+        count = len(points)
+        padded = np.concatenate([points, np.repeat(points[:1], engine.room(count, origins) - count, axis=0)])
+        values = engine.known(engine.stop_gradient(level(theta, engine.constant(padded, origins))))
+        if values is None or values.shape != padded.shape[:1]:
+            raise _Unknown
+        return np.asarray(values[:count], points.dtype)
+
+    def found(origins: np.ndarray, directions: np.ndarray) -> tuple[Any, ...]:
+        # Parameters of no columns stand for those that the engine computes.
+        hits = cast(known, lambda _, points, hit: points[:, :0], {}, origins, directions, layers, **options)
         return hits.hit, hits.distance, hits.entering
 
-    specs = [ArraySpec((layers, count), dtype) for dtype in (bool, np.dtype(str(origins.dtype)), bool)]
-    hit, distance, entering = engine.call_host(found, specs, origins, directions, *leaves(theta))
+    grid = layers, origins.shape[0]
+    specs = [ArraySpec(grid, dtype) for dtype in (bool, np.dtype(str(origins.dtype)), bool)]
+    hit, distance, entering = engine.call_host(found, specs, origins, directions)
     xp = engine.namespace
     points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
     params = describe(theta, points, xp.reshape(hit, (-1,)))
-    params = xp.where(hit[..., None], xp.reshape(params, (layers, count, params.shape[-1])), 0.0)
+    params = xp.where(hit[..., None], xp.reshape(params, (*grid, params.shape[-1])), 0.0)
     return RayHits(hit, distance, params, entering=entering)
 
 

@@ -21,6 +21,9 @@ from rts_surfaces.parameter_checks import RESERVED
 LARGEST = 1e38
 """The largest absolute value of an isovalue, near the limit of single precision."""
 
+FEWEST = 1024
+"""The least number of points for a function that compiles for each shape; larger ones are powers of two."""
+
 Function = Callable[[Mapping[str, Tree], Array], Array]
 """A function of θ and points (M, 3), with one value (M,) or some values (M, C) a point."""
 
@@ -90,7 +93,8 @@ class Field(ScalarField):
         self.f, self.isovalue, self.inside, self.sign = f, value, inside, SIDES[inside]
         self.name = getattr(f, "__name__", type(f).__name__)
         self._reads = None if reads is None else tuple(reads)
-        self._room: Callable[[int], int] | None = None
+        # Functions of jax.numpy, for one, give arrays of jax for points of NumPy.
+        self._compiles = False
 
     def __repr__(self) -> str:
         return f"Field({self.name}, {self.isovalue:g}, {self.inside!r})"
@@ -120,29 +124,21 @@ class Field(ScalarField):
             if isinstance(error, RtsError):
                 raise
             raise InputError(self._why(error, engine_of(points))) from error
+        compiles = self._compiles or (type(points) is np.ndarray and not isinstance(value, np.ndarray))
         if not engine_of(points).differentiates and getattr(value, "dtype", None) == np.float32:
             value = np.asarray(value, points.dtype)  # Differences for slopes are taken in float64.
         check_result("f", value, points)
+        self._compiles = compiles
         return self.sign * (value - self.isovalue)
 
     def _value(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The values (M,) of `f`.
-
-        Some functions give arrays of another engine for points of NumPy, such as those that are written with jax.numpy.
-        Where that engine compiles operations for each shape, they get points of few shapes: padded by the first one.
-        """
+        """The values (M,) of `f`, which gets points of few shapes where it compiles for each."""
         count = points.shape[0]
-        if self._room is None or type(points) is not np.ndarray or not count:
-            value = self.f(theta, points)
-            if (
-                type(points) is np.ndarray
-                and hasattr(value, "dtype")
-                and not isinstance(value, (np.ndarray, np.generic))
-            ):
-                self._room = partial(engine_of(value).room, x=value)
-            return value
-        more = self._room(count) - count
-        return np.asarray(self.f(theta, np.concatenate([points, np.repeat(points[:1], more, axis=0)])))[:count]
+        if not (self._compiles and type(points) is np.ndarray and count):
+            return self.f(theta, points)
+        more = max(FEWEST, 1 << (count - 1).bit_length()) - count
+        value = self.f(theta, np.concatenate([points, np.repeat(points[:1], more, axis=0)]))
+        return np.asarray(value)[:count] if shape_of(value) == (count + more,) else value
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""

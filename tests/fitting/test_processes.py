@@ -58,7 +58,9 @@ def test_a_job_goes_on_after_a_process_has_ended(tmp_path):
     code, output = run(2, "adam", ended, tmp_path / "checkpoint", "1:23", restarts=1)
     assert code == 0, output
     assert Path(f"{ended}.ended").exists() and "has ended" in output
-    np.testing.assert_allclose(results(ended)["history"], results(alone)["history"], rtol=1e-5)
+    one, two = results(alone), results(ended)
+    for name in one:
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.thorough

@@ -77,7 +77,8 @@ def test_texels_are_judged_by_their_area():
 
 
 @pytest.mark.thorough
-def test_a_quick_version_writes_picture_numbers_and_rows(tmp_path, name="blur"):
+def test_a_quick_version_writes_picture_numbers_and_rows(tmp_path):
+    name = "blur"
     with pytest.raises(SystemExit) as stop:
         command.main([name, "--quick", "-o", str(tmp_path)])
     assert not stop.value.code

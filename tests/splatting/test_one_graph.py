@@ -69,7 +69,7 @@ def test_it_is_one_graph_for_three_sizes(splatter):
 
 @thorough
 def test_inductor_computes_what_the_loops_compute():
-    """It compiles `edges` for `rts.program`, see `tests/rendering/test_program.py`."""
+    """It compiles the default splatter, `edges`, in `tests/rendering/test_program.py`."""
     torch._dynamo.reset()
     found, image = splats("multi", SIZES[0]), image_of("multi")
     compiled = torch.compile(image, fullgraph=True, dynamic=True)

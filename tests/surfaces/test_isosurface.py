@@ -247,7 +247,7 @@ def glass(theta, gbuffer, camera):
 
 
 @pytest.mark.parametrize("shader", ["normals", glass], ids=["opaque", "glass"])
-@pytest.mark.parametrize("target", ["numpy", "torch-cpu", "jax.jit"])
+@pytest.mark.parametrize("target", [*ALL, "jax.jit"])
 def test_samples_beside_outlines_are_joined_to_tables(target, shader):
     """Two parts, each with a table, alone and in two views: images and gradients are those without tables."""
     engine, weights = target.removesuffix(".jit"), np.random.default_rng(0).random((*SIZE, 4), np.float32)

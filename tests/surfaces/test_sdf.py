@@ -372,8 +372,8 @@ def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, gr
 
 
 def test_a_function_of_jax_alone_is_called_with_few_shapes():
-    """It is compiled for each; its image is that of array code for any engine, in a compiled program and out of it."""
-    jax = pytest.importorskip("jax")
+    """It is compiled for each; in a compiled program and out of it, the image is that of torch."""
+    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
     shapes = set()
 
     def field(theta, points):
@@ -381,18 +381,42 @@ def test_a_function_of_jax_alone_is_called_with_few_shapes():
         return jax.numpy.sqrt((points * points).sum(axis=1) + 1e-12) - theta["radius"]
 
     def same(theta, points):
-        xp = rts.namespace(points)
-        return xp.sqrt(xp.sum(points * points, axis=1) + 1e-12) - theta["radius"]
+        return torch.sqrt((points * points).sum(dim=1) + 1e-12) - theta["radius"]
 
     def image(f):
         camera = rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
         return lambda radius: rts.render(rts.Part(rts.Sdf(f, 1.2), {"radius": radius}, "normals"), camera, (20, 24))
 
     radius, one = jax.numpy.float32(0.9), jax.numpy.float32(1)
-    expected = [np.asarray(x) for x in jax.jvp(image(same), (radius,), (one,))]
+    expected = [x.numpy() for x in torch.func.jvp(image(same), (torch.tensor(0.9),), (torch.tensor(1.0),))]
     for way in (image(field), jax.jit(image(field))):
         shapes.clear()
         for mine, other in zip(jax.jvp(way, (radius,), (one,)), expected, strict=True):
-            # Slopes of the function are differences of its values, which are of single precision.
+            # In a program slopes of the function are differences of its values, which are of single precision.
             assert np.linalg.norm(np.asarray(mine) - other) < 5e-3 * np.linalg.norm(other)
         assert len(shapes) < 10
+
+
+def test_a_function_has_the_arrays_of_jax_that_theta_has():
+    """Out of a program, functions may do what jax alone does, of numbers of all kinds; and close over traced arrays."""
+    jax = pytest.importorskip("jax")
+    camera = rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
+
+    def image(theta, scale=1.0):
+        def field(theta, points):
+            radius = theta["of"]["radius"].at[0].multiply(scale)[0]
+            return jax.numpy.sqrt((points * points).sum(axis=1) * theta["count"] + 1e-12) - radius
+
+        part = rts.Part(rts.Sdf(field, 1.2), theta, "silhouette")
+        return rts.render(part, camera, (12, 16), splatter="none")[..., 3]
+
+    def theta(radius):
+        return {"of": {"radius": jax.numpy.full(1, radius)}, "count": jax.numpy.int32(1)}
+
+    expected = np.asarray(image(theta(0.9)))
+    assert 10 < expected.sum() < 100
+    np.testing.assert_array_equal(jax.jvp(lambda s: image(theta(1.8), s), (0.5,), (1.0,))[0], expected)
+    radii = jax.numpy.asarray([0.9, 0.5], "float32")
+    both = jax.vmap(lambda r: image({"of": {"radius": r[None]}, "count": 1}))(radii)
+    np.testing.assert_array_equal(both[0], expected)
+    assert 0 < both[1].sum() < expected.sum()

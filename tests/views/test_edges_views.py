@@ -181,7 +181,7 @@ def test_vmap_over_poses_is_a_loop_of_views(name):
 
 
 @thorough
-@pytest.mark.parametrize(("name", "compiled"), [("three", False), ("three", True)])
+@pytest.mark.parametrize(("name", "compiled"), [("three", False), ("three", True), ("glass", False)])
 def test_jax_draws_and_pulls_the_views_of_a_loop(name, compiled):
     jax = pytest.importorskip("jax")
     pose, splatter, way = jax.numpy.asarray(POSE, "float32"), Counted(), jax.jit if compiled else (lambda f: f)

@@ -12,6 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 import rts
+from rts.errors import InputWarning, warn
 from rts.plugin_api.checks import check_numbers, quoted
 from rts_robot.robot import Robot
 from rts_robot.starts import find_starts
@@ -98,12 +99,15 @@ def calibrate(
         offsets: names of joints to whose values an unknown number is added, the same in all views.
         loss: of each pixel, as in `rts.ImageResiduals`: a robust one where something may hide the robot.
         f_scale: the difference beyond which a robust loss counts less; by default 0.5.
-        seed: of the search for a start.
+        seed: of the search for a start. Where the robot fits the masks badly after it, up to three more follow.
         progress: as in `rts.fit`.
 
     Raises:
         rts.InputError: an argument of another shape, a mask in which nothing is inside or that holds other numbers, a
             robot whose joints do not move, or an offset that the masks do not tell.
+
+    Warns:
+        rts.errors.InputWarning: the robot fits the masks badly.
     """
     begun = time.perf_counter()
     masks, values = _checked(robot, masks, values)
@@ -124,6 +128,12 @@ def calibrate(
     covariance, camera = final.covariance(), final.camera
     deviations = np.sqrt(np.diag(covariance)[6:])
     ious = _ious(robot, moved, camera, masks)
+    if ious.mean() <= FOUND:
+        warn(
+            f"the robot and its masks have a mean IoU of {ious.mean():.2f}: the camera may be a wrong one; compare the "
+            f"masks, the joint values and the intrinsics with the robot, or give a start",
+            InputWarning,
+        )
     return Calibration(
         np.linalg.inv(view),
         covariance[:6, :6],
@@ -149,7 +159,7 @@ def _roughly(
     progress: bool | None,
 ) -> np.ndarray:
     """Camera-from-base (4, 4) after the coarse stage, from a start or from the best of those that are searched for."""
-    fits: list[tuple[float, np.ndarray]] = []
+    fits: list[tuple[float, _Problem, Any]] = []
     for number in range(TRIES):
         if start is None:
             starts = find_starts(robot, values, masks, intrinsics, seed=seed + number)
@@ -158,12 +168,13 @@ def _roughly(
         for view in starts:
             problem = _Problem(robot, masks, values, intrinsics, view, (), loss, apart=True)
             fit = problem.fitted(COARSE, progress)
-            fits.append((fit.loss, problem.view_at(fit.parameters)))
-        _, best = min(fits, key=lambda fit: fit[0])
-        camera = _Problem(robot, masks, values, intrinsics, best, (), loss).camera
+            fits.append((fit.loss, problem, fit.parameters))
+        _, problem, parameters = min(fits, key=lambda fit: fit[0])
+        camera = problem.scene(parameters, 0)[1]
         if start is not None or _ious(robot, values, camera, masks).mean() > FOUND:
-            return best
-    return min(fits, key=lambda fit: fit[0])[1]
+            return problem.view_at(parameters)
+    _, problem, parameters = min(fits, key=lambda fit: fit[0])
+    return problem.view_at(parameters)
 
 
 class _Problem:
