@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import engine_of, namespace
-from rts.plugin_api.arrays import Array, Tree, map_leaves
+from rts.plugin_api.arrays import Array, map_leaves
 from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import ArraySpec, RayHits
 from rts_surfaces.implicit.regions import Region
 
-Level = Callable[[Tree, Array], Array]
-Describe = Callable[[Tree, Array, Array], Array]
+Level = Callable[[Array], Array]
+Describe = Callable[[Array, Array], Array]
 
 STEPS, WITH_BOUND = 256, 512
 """The number of shortest steps across the region, without and with a Lipschitz constant."""
@@ -63,7 +63,6 @@ def per_level(slope: Array, hit: Array) -> Array:
 def cast(
     level: Level,
     describe: Describe,
-    theta: Tree,
     origins: Array,
     directions: Array,
     layers: int,
@@ -80,9 +79,8 @@ def cast(
     levels, of few shapes, and parameters.
 
     Args:
-        level: θ and points (M, 3) → (M,), negative inside, zero counts as outside.
-        describe: a function of θ, points (M, 3) and marks (M,) bool of those on the surface; gives parameters (M, P).
-        theta: θ, constant.
+        level: points (M, 3) → (M,), negative inside, zero counts as outside.
+        describe: a function of points (M, 3) and marks (M,) bool of those on the surface; gives parameters (M, P).
         origins: (R, 3).
         directions: (R, 3), of any length but zero.
         layers: K.
@@ -98,7 +96,7 @@ def cast(
     if engine.room(1, origins) > 1 and engine.on_host(origins) and origins.shape[0]:
         options = {"within": within, "lipschitz": lipschitz, "steps": steps}
         with suppress(_Unknown):
-            return _cast_on_host(level, describe, theta, origins, directions, layers, options)
+            return _cast_on_host(level, describe, origins, directions, layers, options)
     length = xp.sqrt(xp.sum(directions * directions, axis=-1))
     enter, leave = within.span(origins, directions)
     if steps is None:
@@ -111,11 +109,10 @@ def cast(
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
     most = steps + 1  # The shortest steps need no more to cross the region.
-    at, described = partial(level, theta), partial(describe, theta)
-    free = partial(without_derivative, at)
+    free = partial(without_derivative, level)
     if engine.padded(origins):
-        return _cast_all(at, free, described, rays, enter, layers, most)
-    return _cast_some(at, free, described, rays, enter, layers, most)
+        return _cast_all(level, free, describe, rays, enter, layers, most)
+    return _cast_some(level, free, describe, rays, enter, layers, most)
 
 
 class _Unknown(Exception):
@@ -123,7 +120,7 @@ class _Unknown(Exception):
 
 
 def _cast_on_host(
-    level: Level, describe: Describe, theta: Tree, origins: Array, directions: Array, layers: int, options: dict
+    level: Level, describe: Describe, origins: Array, directions: Array, layers: int, options: dict
 ) -> RayHits:
     """See `cast`: NumPy takes the steps.
 
@@ -132,17 +129,17 @@ def _cast_on_host(
     """
     engine = engine_of(origins)
 
-    def known(_: Tree, points: np.ndarray) -> np.ndarray:
+    def known(points: np.ndarray) -> np.ndarray:
         count = len(points)
         padded = np.concatenate([points, np.repeat(points[:1], engine.room(count, origins) - count, axis=0)])
-        values = engine.known(engine.stop_gradient(level(theta, engine.constant(padded, origins))))
+        values = engine.known(engine.stop_gradient(level(engine.constant(padded, origins))))
         if values is None or values.shape != padded.shape[:1]:
             raise _Unknown
         return np.asarray(values[:count], points.dtype)
 
     def found(origins: np.ndarray, directions: np.ndarray) -> tuple[Any, ...]:
         # Parameters of no columns stand for those that the engine computes.
-        hits = cast(known, lambda _, points, hit: points[:, :0], {}, origins, directions, layers, **options)
+        hits = cast(known, lambda points, hit: points[:, :0], origins, directions, layers, **options)
         return hits.hit, hits.distance, hits.entering
 
     grid = layers, origins.shape[0]
@@ -150,7 +147,7 @@ def _cast_on_host(
     hit, distance, entering = engine.call_host(found, specs, origins, directions)
     xp = engine.namespace
     points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
-    params = describe(theta, points, xp.reshape(hit, (-1,)))
+    params = describe(points, xp.reshape(hit, (-1,)))
     params = xp.where(hit[..., None], xp.reshape(params, (*grid, params.shape[-1])), 0.0)
     return RayHits(hit, distance, params, entering=entering)
 

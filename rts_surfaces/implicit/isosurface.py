@@ -302,9 +302,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             self._check_finite({"values": known}, lattice)
         steps = np.linalg.norm(high - low) * STEPS_PER_CELL / lattice.step.min()
         return cast(
-            self._capped if self.closed else self.field.level,
-            self._moving,
-            theta,
+            partial(self._capped if self.closed else self.field.level, theta),
+            partial(self._moving, theta),
             self.field.in_theta_dtype(theta, origins),
             self.field.in_theta_dtype(theta, directions),
             layers,

@@ -84,11 +84,10 @@ class Sdf(Implicit, RaySurface):
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
         """The nearest hits within the ball, in θ's dtype; see `rts.RaySurface`."""
-        level = self.field.level
+        level = partial(self.field.level, theta)
         return cast(
             level,
-            lambda theta, points, hit: moving(partial(level, theta), points, hit),
-            theta,
+            partial(moving, level),
             self.field.in_theta_dtype(theta, origins),
             self.field.in_theta_dtype(theta, directions),
             layers,

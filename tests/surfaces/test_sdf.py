@@ -116,11 +116,11 @@ def test_rays_are_clipped_to_boxes_as_to_balls():
     for engine in ALL:
         rays, theta = arrays(engine, (origins, directions)), arrays(engine, {"radii": RADII})
 
-        def described(theta, points, hit):
-            return moving(lambda p: swept_sphere(theta, p), points, hit)
+        def level(p, theta=theta):
+            return swept_sphere(theta, p)
 
         pair = [
-            cast(swept_sphere, described, theta, *rays, 4, within=within, lipschitz=1.0)
+            cast(level, lambda p, hit, f=level: moving(f, p, hit), *rays, 4, within=within, lipschitz=1.0)
             for within in (ball(np.zeros(3), 1.3), box(low, high))
         ]
         first, second = ([to_numpy(x) for x in hits[:2]] for hits in pair)
