@@ -281,7 +281,7 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
 
 
 def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:
-    """Those halves of intervals in which a surface may end, all first ones before all second ones.
+    """The halves of intervals in which a surface may end, all first ones before all second ones.
 
     `in_middle` is what is seen in the middle of each interval. The second result are the intervals' indices, of both.
     """
