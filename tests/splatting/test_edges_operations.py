@@ -67,7 +67,7 @@ def operands_of(name, operation):
         known = KNOWN[name] = {}
         with pytest.MonkeyPatch.context() as patch:
             for module, own, called in ((splatter, "EDGES", EDGES), (stacks, "CELLS", CELLS)):
-                patch.setattr(module, own, lambda *x, own=own, called=called: called(*known.setdefault(own, x)))
+                patch.setattr(module, own, lambda *x, own=own, called=called, **params: called(*known.setdefault(own, x), **params))
             rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1)
     return list(KNOWN[name][operation])
 
@@ -98,6 +98,10 @@ class TestEdges(OperationConformance):
     @pytest.fixture(params=[*SCENES, "cards, some sides unseen"])
     def operands(self, request):
         return unseen() if request.param not in SCENES else operands_of(request.param, "EDGES")
+
+    @pytest.fixture(params=[0, 3])
+    def params(self, request):
+        return {"border": request.param}
 
 
 class TestCells(OperationConformance):

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, floating_bits, namespace, stopped
 from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Outlines, Splats
@@ -61,22 +62,30 @@ class Edges(SummingSplatter):
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
+        return self._image(splats, 0)
+
+    def cropped(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        return self._image(splats, splats.border)
+
+    def _image(self, splats: Splats, border: int) -> Array:
+        """The image without `border` cells at each side."""
         positions, rgba, row = splats.positions, splats.rgba, splats.row
         if rgba.shape[0] == 0:
-            return nothing(rgba, row)
+            return without_border(nothing(rgba, row), border)
         check_rows(row, rgba.shape[0])
         outlines = splats.outlines
         if outlines is None:
-            return _without_outlines(splats)
+            return without_border(_without_outlines(splats), border)
         check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
         check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         if outlines.stack is None:
-            return EDGES(positions, rgba, row[0, ...], *_fields_of(outlines))
+            return EDGES(positions, rgba, row[0, ...], *_fields_of(outlines), border=border)
         check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
         whole = Operands.of(splats, outlines)
-        image = EDGES(whole.positions, whole.rgba, whole.row, *_fields_of(whole.outlines))
-        return image + whole.motion
+        image = EDGES(whole.positions, whole.rgba, whole.row, *_fields_of(whole.outlines), border=border)
+        return image + without_border(whole.motion, border)
 
     def normal_equations(
         self,
@@ -124,13 +133,16 @@ def _without_outlines(splats: Splats) -> Array:
     return colors + (motion - stopped(motion))
 
 
-def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:
-    """The image (H, W, C) of samples with `row` (H, W), and of outlines, whose fields `arrays` are."""
+def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array, border: int) -> Array:
+    """The image (h, w, C) of samples with `row` (H, W), and of outlines, whose fields `arrays` are.
+
+    A `border` of so many cells is left out at each side.
+    """
     xp, (height, width), outlines = namespace(rgba), row.shape, Outlines(*arrays)
     color, motion = _on_cells(positions, rgba, row)
     image = color - _inside(color, motion, outlines.joined)
     if outlines.place.shape[0] == 0:
-        return image
+        return without_border(image, border)
     breaks = _Breaks.of(outlines, positions, rgba)
     segments = _Segments.of(outlines, breaks)
     parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts(color)]
@@ -138,7 +150,7 @@ def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) ->
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
     # Inductor of torch 2.13, with free sizes, reads sums in another shape before it has made them.
-    return xp.reshape(xp.reshape(image, sums.shape) + sums, image.shape)
+    return without_border(xp.reshape(xp.reshape(image, sums.shape) + sums, image.shape), border)
 
 
 def _on_cells(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array]:
@@ -454,8 +466,10 @@ def _beside_breaks(
     return parts
 
 
-def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
-    return *row, rgba[1]
+def _shape(
+    positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any, border: int
+) -> tuple[int, ...]:
+    return *(n - 2 * border for n in row), rgba[1]
 
 
 EDGES = Operation(
@@ -470,4 +484,5 @@ EDGES = Operation(
     keeps=True,
     crosses=True,
 )
-"""The image (H, W, C) of positions (N, 3), colours (N, C), `row` (H, W), and the fields of `Outlines`."""
+"""The image (h, w, C) of positions (N, 3), colours (N, C), `row` (H, W), and the fields of `Outlines`, without a
+`border` of so many cells."""

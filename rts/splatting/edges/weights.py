@@ -80,21 +80,21 @@ class _Weights(NamedTuple):
         return cls(shown, points, movers, origins, moves, share, cell_side, flux, cells, sides)
 
 
-def forward(operands: Arrays, out: np.ndarray) -> _Weights:
+def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
     """The value, and the weights, which the derivatives use again."""
     from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines = _effective(Outlines(*arrays))
-    parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
+    parallel(loops.inside, len(out), border, positions, rgba, row, outlines.joined, out, work=10 * out.size)
     weights = _Weights.of(outlines)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
     loops.motions(positions, weights.movers, weights.origins, weights.moves, motion)
-    _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out)
+    _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out, border)
     return weights
 
 
-def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | None) -> None:
+def push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, kept: _Weights | None) -> None:
     """The derivative of the value along tangents of positions and colours."""
     from rts.splatting.edges import weights_loops as loops
 
@@ -102,12 +102,15 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | Non
     outlines = _effective(Outlines(*arrays))
     weights = kept or _Weights.of(outlines)
     t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
-    parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
-    _push_outlines(operands, (t_positions, t_rgba), outlines, weights, out)
+    of_cells = rgba, row, outlines.joined, t_positions, t_rgba
+    parallel(loops.push_inside, len(out), border, *of_cells, out, work=10 * out.size)
+    _push_outlines(operands, (t_positions, t_rgba), outlines, weights, out, border)
 
 
-def _push_outlines(operands: Arrays, tangents: Some, outlines: Outlines, weights: _Weights, out: np.ndarray) -> None:
-    """Add to a derivative (H, W, C) what changes at outlines; arguments as of `push`."""
+def _push_outlines(
+    operands: Arrays, tangents: Some, outlines: Outlines, weights: _Weights, out: np.ndarray, border: int
+) -> None:
+    """Add to a derivative (h, w, C) what changes at outlines; arguments as of `push`."""
     from rts.splatting.edges import weights_loops as loops
 
     _, rgba, row, *_ = operands
@@ -116,11 +119,11 @@ def _push_outlines(operands: Arrays, tangents: Some, outlines: Outlines, weights
     if len(t_positions):
         loops.motions(t_positions, weights.movers, NOWHERE, weights.moves, motion)
     jump = _jumps(t_rgba, weights) if len(t_rgba) else np.empty((0, out.shape[2]))
-    _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out)
+    _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out, border)
 
 
 def _add(
-    outlines: Outlines, weights: _Weights, row: np.ndarray, samples: Arrays, jumps: Arrays, out: np.ndarray
+    outlines: Outlines, weights: _Weights, row: np.ndarray, samples: Arrays, jumps: Arrays, out: np.ndarray, border: int
 ) -> None:
     """Add the changes at outlines to an image.
 
@@ -130,17 +133,18 @@ def _add(
         row: (H, W).
         samples: colours and positions, or their tangents, and points, or none; see `edges_loops.add_sides`.
         jumps: constant colours; jumps, constant jumps and motions, see `edges_loops.add_segments`.
-        out: (H, W, C).
+        out: (h, w, C).
+        border: cells around the image.
     """
     from rts.splatting.edges import weights_loops as loops
 
     (rgba, positions, points), (steady, *at_breaks) = samples, jumps
-    loops.add_segments(*_segments(outlines, weights, row), rgba, *at_breaks, out)
-    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
+    loops.add_segments(border, *_segments(outlines, weights, row), rgba, *at_breaks, out)
+    sides = border, row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.add_sides(*sides, steady, rgba, positions, points, out)
 
 
-def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) -> None:
+def pull(operands: Arrays, g: np.ndarray, results: Some, border: int, kept: _Weights | None) -> None:
     """The gradients of positions and colours."""
     from rts.splatting.edges import weights_loops as loops
 
@@ -148,15 +152,15 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
     outlines, g = _effective(Outlines(*arrays)), read_only(g)
     weights = kept or _Weights.of(outlines)
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    loops.pull_inside(rgba, row, outlines.joined, g, g_positions, g_rgba)
+    loops.pull_inside(border, rgba, row, outlines.joined, g, g_positions, g_rgba)
     count, steady = len(weights.shown), _jumps(rgba, weights)
     g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
-    loops.pull_segments(*_segments(outlines, weights, row), steady, g, g_rgba, g_jump, g_motion)
+    loops.pull_segments(border, *_segments(outlines, weights, row), steady, g, g_rgba, g_jump, g_motion)
     if len(g_positions):
         loops.pull_motions(weights.movers, weights.moves, g_motion, g_positions)
     if len(g_rgba):
         loops.pull_jumps(weights.shown, g_jump, g_rgba)
-    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
+    sides = border, row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
 
 
@@ -180,7 +184,7 @@ def normal_equations(
         return image if weights is None else image * weights[at]
 
     image = np.empty((*row.shape, rgba.shape[1]), rgba.dtype)
-    kept = forward(operands, image)
+    kept = forward(operands, image, 0)
     whole = image[border : border + height * side, border : border + width * side]
     if side > 1:
         whole = whole.reshape(height, side, width, side, -1).mean((1, 3))
@@ -196,9 +200,9 @@ def normal_equations(
         tangents = tangent, None if t_rgba is None else t_rgba[i]
         if even:
             flat[cells] = 0.0
-            _push_outlines(operands, tangents, outlines, kept, image)
+            _push_outlines(operands, tangents, outlines, kept, image, 0)
         else:
-            push(operands, tangents, image, kept)
+            push(operands, tangents, image, 0, kept)
         changes = flat[cells]
         if side > 1 and len(first):
             changes = np.add.reduceat(changes, first, axis=0) / side**2

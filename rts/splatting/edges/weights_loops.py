@@ -299,55 +299,64 @@ def _slope(rgba, around, axis, c):
 
 
 @loop
-def inside(first, last, positions, rgba, row, joined, out):
-    """Fill lines `first` to `last` of `out` (H, W, C): colours of cells, moved along their slopes."""
+def inside(first, last, border, positions, rgba, row, joined, out):
+    """Fill lines `first` to `last` of `out` (h, w, C): colours of cells, moved along their slopes."""
     around = np.empty(4, np.int32)
-    for y in range(first, last):
-        for x in range(row.shape[1]):
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            y, x = i + border, j + border
             n = row[y, x]
             if n < 0:
-                out[y, x] = 0.0
+                out[i, j] = 0.0
                 continue
             for c in range(rgba.shape[1]):
-                out[y, x, c] = rgba[n, c]
+                out[i, j, c] = rgba[n, c]
             if _around(row, joined, y, x, around):
                 mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
                 for c in range(rgba.shape[1]):
-                    out[y, x, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
+                    out[i, j, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
 
 
 @loop
-def push_inside(first, last, rgba, row, joined, t_positions, t_rgba, out):
-    """Fill lines of `out` (H, W, C) with the derivative of `inside` along tangents; empty ones are zeros."""
+def push_inside(first, last, border, rgba, row, joined, t_positions, t_rgba, out):
+    """Fill lines of `out` (h, w, C) with the derivative of `inside` along tangents; empty ones are zeros."""
     around = np.empty(4, np.int32)
-    for y in range(first, last):
-        for x in range(row.shape[1]):
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            y, x = i + border, j + border
             n = row[y, x]
             for c in range(rgba.shape[1]):
-                out[y, x, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
+                out[i, j, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
             if n < 0 or not len(t_positions) or not _around(row, joined, y, x, around):
                 continue
             mx, my = t_positions[n, 0], t_positions[n, 1]
             for c in range(rgba.shape[1]):
-                out[y, x, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
+                out[i, j, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
 
 
 @loop
-def pull_inside(rgba, row, joined, g, g_positions, g_rgba):
+def pull_inside(border, rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `inside`; empty ones are not wanted."""
     around = np.empty(4, np.int32)
-    for y in range(row.shape[0]):
-        for x in range(row.shape[1]):
+    for i in range(g.shape[0]):
+        for j in range(g.shape[1]):
+            y, x = i + border, j + border
             n = row[y, x]
             if n < 0:
                 continue
             if len(g_rgba):
                 for c in range(rgba.shape[1]):
-                    g_rgba[n, c] += g[y, x, c]
+                    g_rgba[n, c] += g[i, j, c]
             if len(g_positions) and _around(row, joined, y, x, around):
                 for c in range(rgba.shape[1]):
-                    g_positions[n, 0] -= _slope(rgba, around, 0, c) * g[y, x, c]
-                    g_positions[n, 1] -= _slope(rgba, around, 1, c) * g[y, x, c]
+                    g_positions[n, 0] -= _slope(rgba, around, 0, c) * g[i, j, c]
+                    g_positions[n, 1] -= _slope(rgba, around, 1, c) * g[i, j, c]
+
+
+@compiled
+def _is_in(image, i, j):
+    """True for a pixel of an image (h, w, C); its cells have a border around it."""
+    return 0 <= i < image.shape[0] and 0 <= j < image.shape[1]
 
 
 @compiled
@@ -427,10 +436,11 @@ def _pull_rates(s, k, ties, beyond, flux, first, second, g_motion):
 
 
 @loop
-def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba, jump, steady, motion, out):
-    """Add to an image (H, W, C) the changes that segments make.
+def add_segments(border, square, ties, beyond, share, cell_side, flux, row, shown, rgba, jump, steady, motion, out):
+    """Add to an image (h, w, C) the changes that segments make.
 
     Args:
+        border: cells around the image.
         square: (S, 2) of outlines.
         ties: (S, 2).
         beyond: (S, 2).
@@ -443,13 +453,16 @@ def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba,
         jump: (B, C) jumps of colours, or their tangents; empty for zeros.
         steady: (B, C) jumps that are constants in fluxes.
         motion: (B, 2) motions of breaks, or their tangents; empty for zeros.
-        out: (H, W, C).
+        out: (h, w, C).
     """
     for s in range(len(square)):
         start = ties[s, 0]
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
+            i, j = y - border, x - border
+            if not _is_in(out, i, j):
+                continue
             known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
             if len(motion):
                 first, second = _rates(s, k, ties, beyond, flux, motion)
@@ -462,26 +475,31 @@ def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba,
                     here = _of(rgba, row[y, x], c)
                     value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, cell_side[s, k, 0]], c))
                     value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, cell_side[s, k, 1]], c))
-                out[y, x, c] += value
+                out[i, j, c] += value
 
 
 @loop
-def pull_segments(square, ties, beyond, share, cell_side, flux, row, shown, steady, g, g_rgba, g_jump, g_motion):
+def pull_segments(
+    border, square, ties, beyond, share, cell_side, flux, row, shown, steady, g, g_rgba, g_jump, g_motion
+):  # fmt: skip
     """Add to gradients of colours, jumps (B, C) and motions (B, 2) those of `add_segments`; empty ones: not wanted."""
     for s in range(len(square)):
         start = ties[s, 0]
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
+            i, j = y - border, x - border
+            if not _is_in(g, i, j):
+                continue
             known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
             for c in range(g.shape[2]):
-                first += g[y, x, c] * steady[start, c]
-                second += g[y, x, c] * steady[end, c]
+                first += g[i, j, c] * steady[start, c]
+                second += g[i, j, c] * steady[end, c]
                 if len(g_jump):
-                    g_jump[start, c] += share[s, k, 0] * g[y, x, c]
-                    g_jump[end, c] += share[s, k, 1] * g[y, x, c]
+                    g_jump[start, c] += share[s, k, 0] * g[i, j, c]
+                    g_jump[end, c] += share[s, k, 1] * g[i, j, c]
                 if len(g_rgba) and known:
-                    one, other = abs(share[s, k, 0]) * g[y, x, c], abs(share[s, k, 1]) * g[y, x, c]
+                    one, other = abs(share[s, k, 0]) * g[i, j, c], abs(share[s, k, 1]) * g[i, j, c]
                     _add_to(g_rgba, shown[start, cell_side[s, k, 0]], c, one)
                     _add_to(g_rgba, shown[end, cell_side[s, k, 1]], c, other)
                     _add_to(g_rgba, row[y, x], c, -one - other)
@@ -522,10 +540,11 @@ def _moved(positions, row, rows, points, sides, b, i, y, x):
 
 
 @loop
-def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, out):
-    """Add to an image (H, W, C) the changes beside breaks.
+def add_sides(border, row, rows, shown, cells, sides, steady, rgba, positions, points, out):
+    """Add to an image (h, w, C) the changes beside breaks.
 
     Args:
+        border: cells around the image.
         row: (H, W) int32.
         rows: (B, 2), the last samples.
         shown: (B, 2), those that tell colours.
@@ -535,7 +554,7 @@ def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, o
         rgba: (N, C) colours, or their tangents; empty for zeros.
         positions: (N, 3), or their tangents; empty for zeros.
         points: (B, 2, 2), see `motions`; empty for tangents.
-        out: (H, W, C).
+        out: (h, w, C).
     """
     width = row.shape[1]
     for b in range(len(cells)):
@@ -544,6 +563,8 @@ def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, o
                 continue
             y, x = divmod(cells[b, i, 0], width)
             there_y, there_x = divmod(cells[b, i, 1], width)
+            here_in = _is_in(out, y - border, x - border)
+            there_in = _is_in(out, there_y - border, there_x - border)
             from_y, from_x = divmod(cells[b, i, 2], width)
             last, here, former = shown[b, i], row[y, x], row[from_y, from_x]
             move = _moved(positions, row, rows, points, sides, b, i, y, x) if len(positions) else 0.0
@@ -555,12 +576,14 @@ def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, o
                 if len(rgba):
                     near += sides[b, i, 1] * (rgba[former, c] - rgba[here, c])
                     far += sides[b, i, 2] * (rgba[last, c] - rgba[former, c])
-                out[y, x, c] += near
-                out[there_y, there_x, c] += far
+                if here_in:
+                    out[y - border, x - border, c] += near
+                if there_in:
+                    out[there_y - border, there_x - border, c] += far
 
 
 @loop
-def pull_sides(row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
+def pull_sides(border, row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
     """Add to gradients of colours and positions those of `add_sides`; empty ones are not wanted."""
     width = row.shape[1]
     for b in range(len(cells)):
@@ -571,8 +594,10 @@ def pull_sides(row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
             there_y, there_x = divmod(cells[b, i, 1], width)
             from_y, from_x = divmod(cells[b, i, 2], width)
             last, here, former, move = shown[b, i], row[y, x], row[from_y, from_x], 0.0
+            y, x, there_y, there_x = y - border, x - border, there_y - border, there_x - border
+            here_in, there_in = _is_in(g, y, x), _is_in(g, there_y, there_x)
             for c in range(g.shape[2]):
-                near, far = g[y, x, c], g[there_y, there_x, c]
+                near, far = g[y, x, c] if here_in else 0.0, g[there_y, there_x, c] if there_in else 0.0
                 move += (sides[b, i, 0] * near + (1 - sides[b, i, 0]) * far) * (steady[last, c] - steady[here, c])
                 if len(g_rgba):
                     g_near, g_far = sides[b, i, 1] * near, sides[b, i, 2] * far
