@@ -16,6 +16,13 @@ BAND_ROWS = 16
 
 BLOCK = 64
 
+WIDE = 12
+"""Columns of a triangle from which on its rows are drawn whole, where one layer is kept: below, collected hits cost
+less."""
+
+AT_ONCE = 8
+"""Columns in a vector instruction: numbers for a few beyond the last cost less than one by one."""
+
 LISTED = 8
 """Numbers listed for a triangle: its index, its three vertices, first and last column, first and last row of pixels."""
 
@@ -69,6 +76,8 @@ def _draw(items, geometry, top, end, width, layered):
     rows, vertices, matrix, view_depth, keep = geometry
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), vertices.dtype)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    first, nearest, triangle_ids, barycentrics = layered
+    in_row, in_row_within = np.empty(width + AT_ONCE), np.empty((2, width + AT_ONCE), np.float32)
     most = 4 * BLOCK
     # Room for hits left from a row, four for each small triangle, and one more row.
     room = 2 * most + width
@@ -89,10 +98,16 @@ def _draw(items, geometry, top, end, width, layered):
                     hits[count, 0], hits[count, 1] = place + (n >> 1), i0 + (n & 1)
                     count += (covers[b] >> n) & 1
                 continue
+            whole, n = len(nearest) == 1 and i1 - i0 >= WIDE - 1 and not clips[b], i1 - i0 + 1
             for j in range(j0, j1 + 1):
                 y = j + 0.5
                 ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
                 rc = numbers[7, b] * y + numbers[8, b]
+                if whole:
+                    _row(b, numbers, i0, n, ra, rb, rc, in_row, in_row_within)
+                    cell = (j - top) * width + i0
+                    _put_row(entries[0, b], n, in_row, in_row_within, cell, first, nearest, triangle_ids, barycentrics)
+                    continue
                 for i in range(i0, i1 + 1):
                     x = i + 0.5
                     ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
@@ -103,6 +118,47 @@ def _draw(items, geometry, top, end, width, layered):
                     _insert(hits[:count], met, drawn, layered)
                     count = 0
         _insert(hits[:count], met, drawn, layered)
+
+
+@compiled
+def _row(b, numbers, i0, count, ra, rb, rc, depths, within):
+    """Fill in depths (count,) and first two barycentrics (2, count) of a triangle in a row; inf where it covers nothing.
+
+    Args:
+        b: the triangle in its block; it needs no clipping.
+        numbers: those of the block, see `_set_up`.
+        i0: the first column.
+        count: how many columns there are.
+        ra: its first edge function at x = 0 in the row.
+        rb: the second.
+        rc: the third.
+        depths: to fill; with `within`, `AT_ONCE` longer than the row.
+        within: to fill.
+    """
+    xa, xb, xc = numbers[0, b], numbers[3, b], numbers[6, b]
+    za, zb, zc = numbers[9, b], numbers[10, b], numbers[11, b]
+    # As in `_covers`.
+    oa, ob, oc = owns(xa, numbers[1, b]), owns(xb, numbers[4, b]), owns(xc, numbers[7, b])
+    for n in range((count + AT_ONCE - 1) // AT_ONCE * AT_ONCE):
+        x = np.float64(i0 + n) + 0.5
+        ea, eb, ec = xa * x + ra, xb * x + rb, xc * x + rc
+        total = ea + eb + ec
+        covers = ((ea > 0) | ((ea == 0) & oa)) & ((eb > 0) | ((eb == 0) & ob)) & ((ec > 0) | ((ec == 0) & oc))
+        scale, z = 1 / total, (ea * za + eb * zb + ec * zc) / total
+        depths[n] = z if covers & (total > 0) else np.inf
+        within[0, n], within[1, n] = ea * scale, eb * scale
+
+
+@compiled
+def _put_row(t, count, depths, within, place, first, nearest, triangle_ids, barycentrics):
+    """Put what `_row` gave, of triangle t, into the one layer of cells from `place` on; see `_put`."""
+    for n in range(count):
+        z, cell = depths[n], place + n
+        old = nearest[0, cell]
+        # The same holds along most of a row, so that jumps are predicted.
+        if z < old or (z == old and z < np.inf and t < triangle_ids[0, first + cell]):
+            nearest[0, cell], triangle_ids[0, first + cell] = z, t
+            barycentrics[0, first + cell, 0], barycentrics[0, first + cell, 1] = within[0, n], within[1, n]
 
 
 # numba itself must inline these helpers: only with known lengths of rows do their loops become vector code.
