@@ -155,21 +155,26 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
         joined: (2, H, W) bool to fill: along x, and along y.
     """
     (height, width), corners = part.shape, np.empty((3, 4))
+    apart = np.empty(width, np.bool_)
     for y in range(first, last):
-        for x in range(width):
-            if not part_range[0] <= part[y, x] < part_range[1]:
-                continue
-            for axis in range(2):
-                dx, dy = 1 - axis, axis
-                if x + dx == width or y + dy == height or met[axis, y, x] == 2:
-                    continue
-                if part[y + dy, x + dx] != part[y, x]:
+        for axis in range(2):
+            dx, dy = 1 - axis, axis
+            count = width - dx if y + dy < height else 0
+            # Without branches, for a loop that takes several cells at once.
+            for x in range(count):
+                own, there = part[y, x], part[y + dy, x + dx]
+                same = (own >= part_range[0]) & (own < part_range[1]) & (own == there) & (met[axis, y, x] != 2)
+                one = triangle[y, x] == triangle[y + dy, x + dx]
+                joined[axis, y, x] |= same & one
+                apart[x] = same & ~one
+            for x in range(count):
+                if not apart[x]:
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s
                 next_ = one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
                 # Around a corner that two triangles have in common the sheet neither ends nor turns away.
-                if t != s and not next_ and (met[axis, y, x] != 0 or not _touch(faces, t, s)):
+                if not next_ and (met[axis, y, x] != 0 or not _touch(faces, t, s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
                     end = _walked(t, s, start, axis, at, seen, faces, beyond)
                 joined[axis, y, x] = end == s

@@ -304,7 +304,7 @@ def inside(first, last, border, positions, rgba, row, joined, out):
     around = np.empty(4, np.int32)
     for i in range(first, last):
         for j in range(out.shape[1]):
-            y, x = i + border, j + border
+            y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
             n = row[y, x]
             if n < 0:
                 out[i, j] = 0.0
@@ -323,7 +323,7 @@ def push_inside(first, last, border, rgba, row, joined, t_positions, t_rgba, out
     around = np.empty(4, np.int32)
     for i in range(first, last):
         for j in range(out.shape[1]):
-            y, x = i + border, j + border
+            y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
             n = row[y, x]
             for c in range(rgba.shape[1]):
                 out[i, j, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
@@ -340,7 +340,7 @@ def pull_inside(border, rgba, row, joined, g, g_positions, g_rgba):
     around = np.empty(4, np.int32)
     for i in range(g.shape[0]):
         for j in range(g.shape[1]):
-            y, x = i + border, j + border
+            y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
             n = row[y, x]
             if n < 0:
                 continue
