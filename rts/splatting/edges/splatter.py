@@ -469,7 +469,7 @@ def _beside_breaks(
 def _shape(
     positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any, border: int
 ) -> tuple[int, ...]:
-    return *(n - 2 * border for n in row), rgba[1]
+    return *(max(0, n - 2 * border) for n in row), rgba[1]
 
 
 EDGES = Operation(
