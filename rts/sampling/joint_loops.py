@@ -7,7 +7,7 @@ import numpy as np
 from rts.compiling.loops import loop
 from rts.compiling.threads import TASKS_PER_THREAD, parallel, read_only, thread_count
 from rts.contracts.records import Fragments
-from rts.sampling.packing_loops import write_sample
+from rts.sampling.packing_loops import param_at
 
 
 def packed_by_part(
@@ -85,6 +85,7 @@ def _pack(
         row: (M,) to fill.
         depth: (M,) to fill.
     """
+    plain = len(corners) == 0
     for piece in range(start, stop):
         for m in range(bounds[piece], bounds[piece + 1]):
             if not there[m]:
@@ -93,5 +94,11 @@ def _pack(
             t, a, b = triangles[m], shares[m, 0], shares[m, 1]
             n = ahead[piece, part_of[t]]
             ahead[piece, part_of[t]] = n + 1
-            write_sample(n, t, a, b, table, corners, ids, params)
+            for i in range(ids.shape[1]):
+                ids[n, i] = table[t, i]
+            if plain:
+                params[n, 0], params[n, 1] = a, b
+            else:
+                for i in range(params.shape[1]):
+                    params[n, i] = param_at(corners, t, i, a, b)
             row[m], depth[m] = n, depths[m]

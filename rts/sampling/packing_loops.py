@@ -106,16 +106,10 @@ def _count(start, stop, kept, counts):
 
 
 @compiled
-def write_sample(n, t, a, b, table, corners, ids, params):
-    """Write row n of ids (N, I) and params (N, P): a triangle's ids, and its corners at the first two barycentrics."""
-    for i in range(ids.shape[1]):
-        ids[n, i] = table[t, i]
-    if len(corners) == 0:
-        params[n, 0], params[n, 1] = a, b
-    else:
-        for i in range(params.shape[1]):
-            c = corners[t, 2, i]
-            params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
+def param_at(corners, t, i, a, b):
+    """The parameter i of triangle t, of `corners` (T, 3, P), at the first two barycentrics."""
+    c = corners[t, 2, i]
+    return c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
 
 
 @loop
@@ -137,6 +131,7 @@ def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners,
         row: (L, W) int32, to be filled; −1 for cells without a row.
         depth: (L, W) float32, to be filled; 0 for cells without a row.
     """
+    plain = len(corners) == 0
     for y in range(start, stop):
         n = offsets[y]
         for x in range(kept.shape[1]):
@@ -144,6 +139,12 @@ def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners,
                 row[y, x], depth[y, x] = -1, 0
                 continue
             t, a, b = triangle_ids[y, x], barycentrics[y, x, 0], barycentrics[y, x, 1]
-            write_sample(n, t, a, b, table, corners, ids, params)
+            for i in range(ids.shape[1]):
+                ids[n, i] = table[t, i]
+            if plain:
+                params[n, 0], params[n, 1] = a, b
+            else:
+                for i in range(params.shape[1]):
+                    params[n, i] = param_at(corners, t, i, a, b)
             row[y, x], depth[y, x] = n, depths[y, x]
             n += 1

@@ -279,65 +279,69 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
 
 
 @compiled
-def _around(row, joined, y, x, around):
-    """Fill `around` with the samples of the next cells to the left and right, above and below; see `_slope`.
+def _beside(row, joined, y, x):
+    """The samples of the next cells to the left and right, above and below; see `_slope`.
 
-    Where the next cell shows another surface, the cell's own sample stands in. False if there is no slope.
+    Where the next cell shows another surface, the cell's own sample stands in.
     """
     n = row[y, x]
-    around[0] = row[y, x - 1] if x > 0 and joined[0, y, x - 1] else n
-    around[1] = row[y, x + 1] if joined[0, y, x] else n
-    around[2] = row[y - 1, x] if y > 0 and joined[1, y - 1, x] else n
-    around[3] = row[y + 1, x] if joined[1, y, x] else n
-    return around[0] != around[1] or around[2] != around[3]
+    left = row[y, x - 1] if x > 0 and joined[0, y, x - 1] else n
+    right = row[y, x + 1] if joined[0, y, x] else n
+    above = row[y - 1, x] if y > 0 and joined[1, y - 1, x] else n
+    below = row[y + 1, x] if joined[1, y, x] else n
+    return left, right, above, below
 
 
 @compiled
-def _slope(rgba, around, axis, c):
+def _slope(rgba, before, after, c):
     """The slope of a channel at a cell: the mean of the differences from and to the next cells of the same surface."""
-    return (rgba[around[2 * axis + 1], c] - rgba[around[2 * axis], c]) / 2
+    return (rgba[after, c] - rgba[before, c]) / 2
 
 
 @loop
 def inside(first, last, border, positions, rgba, row, joined, out):
     """Fill lines `first` to `last` of `out` (h, w, C): colours of cells, moved along their slopes."""
-    around = np.empty(4, np.int32)
     for i in range(first, last):
         for j in range(out.shape[1]):
             y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
             n = row[y, x]
             if n < 0:
-                out[i, j] = 0.0
-                continue
-            for c in range(rgba.shape[1]):
-                out[i, j, c] = rgba[n, c]
-            if _around(row, joined, y, x, around):
-                mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
                 for c in range(rgba.shape[1]):
-                    out[i, j, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
+                    out[i, j, c] = 0.0
+                continue
+            left, right, above, below = _beside(row, joined, y, x)
+            if left == right and above == below:
+                for c in range(rgba.shape[1]):
+                    out[i, j, c] = rgba[n, c]
+                continue
+            mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
+            for c in range(rgba.shape[1]):
+                moved = _slope(rgba, left, right, c) * mx + _slope(rgba, above, below, c) * my
+                out[i, j, c] = rgba[n, c] - moved
 
 
 @loop
 def push_inside(first, last, border, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (h, w, C) with the derivative of `inside` along tangents; empty ones are zeros."""
-    around = np.empty(4, np.int32)
     for i in range(first, last):
         for j in range(out.shape[1]):
             y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
             n = row[y, x]
             for c in range(rgba.shape[1]):
                 out[i, j, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
-            if n < 0 or not len(t_positions) or not _around(row, joined, y, x, around):
+            if n < 0 or not len(t_positions):
+                continue
+            left, right, above, below = _beside(row, joined, y, x)
+            if left == right and above == below:
                 continue
             mx, my = t_positions[n, 0], t_positions[n, 1]
             for c in range(rgba.shape[1]):
-                out[i, j, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
+                out[i, j, c] -= _slope(rgba, left, right, c) * mx + _slope(rgba, above, below, c) * my
 
 
 @loop
 def pull_inside(border, rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `inside`; empty ones are not wanted."""
-    around = np.empty(4, np.int32)
     for i in range(g.shape[0]):
         for j in range(g.shape[1]):
             y, x = np.uint32(i + border), np.uint32(j + border)  # Compiled code need not check for negative ones.
@@ -347,10 +351,13 @@ def pull_inside(border, rgba, row, joined, g, g_positions, g_rgba):
             if len(g_rgba):
                 for c in range(rgba.shape[1]):
                     g_rgba[n, c] += g[i, j, c]
-            if len(g_positions) and _around(row, joined, y, x, around):
+            if not len(g_positions):
+                continue
+            left, right, above, below = _beside(row, joined, y, x)
+            if left != right or above != below:
                 for c in range(rgba.shape[1]):
-                    g_positions[n, 0] -= _slope(rgba, around, 0, c) * g[i, j, c]
-                    g_positions[n, 1] -= _slope(rgba, around, 1, c) * g[i, j, c]
+                    g_positions[n, 0] -= _slope(rgba, left, right, c) * g[i, j, c]
+                    g_positions[n, 1] -= _slope(rgba, above, below, c) * g[i, j, c]
 
 
 @compiled
