@@ -31,6 +31,7 @@ from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
+from rts.plugin_base import overrides
 from rts.splatting.cells import centres, check_rows, nothing, unpack
 from rts.splatting.edges import weights as edges_weights
 from rts.splatting.edges.stacks import CELLS, Operands
@@ -65,8 +66,8 @@ class Edges(SummingSplatter):
         return self._image(splats, 0)
 
     def cropped(self, splats: Splats) -> Array:
-        """See `rts.Splatter`."""
-        return self._image(splats, splats.border)
+        """See `rts.Splatter`; drawn without the border, unless a subclass has an `image` of its own."""
+        return super().cropped(splats) if overrides(self, "image", Edges) else self._image(splats, splats.border)
 
     def _image(self, splats: Splats, border: int) -> Array:
         """The image without `border` cells at each side."""
