@@ -2,5 +2,6 @@
 
 import os
 
-# Spinning threads of two libraries take each other's cores. Read when a library is first imported.
+# As `import rts` sets them, where torch comes first: spinning threads of two libraries take each other's cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")

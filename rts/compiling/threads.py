@@ -21,7 +21,11 @@ import numpy as np
 
 TORCH_SPINS = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
 """Whether torch was imported before rts: its idle OpenMP threads then spin, on cores that loops could use."""
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Read where torch is imported, or another user of OpenMP.
+if "OMP_WAIT_POLICY" not in os.environ:
+    # Read where torch is imported, or another user of OpenMP.
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 TASKS_PER_THREAD = 4
 """Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""

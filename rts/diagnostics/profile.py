@@ -43,7 +43,7 @@ HINTS = {
 
 SPINNING = (
     "\nTorch was imported before rts: its idle threads may take cores. "
-    "Import rts first, or set OMP_WAIT_POLICY=PASSIVE."
+    "Import rts first, or set OMP_WAIT_POLICY=PASSIVE and GOMP_SPINCOUNT=1000."
 )
 
 
