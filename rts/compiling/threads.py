@@ -19,14 +19,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-TORCH_SPINS = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
-"""Whether torch was imported before rts: its idle OpenMP threads then spin, on cores that loops could use."""
-if "OMP_WAIT_POLICY" not in os.environ:
-    # Read where torch is imported, or another user of OpenMP.
-    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
 TASKS_PER_THREAD = 4
 """Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""
 

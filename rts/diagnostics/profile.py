@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import is_constant
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.compiling.threads import TORCH_SPINS
+from rts.compiling.process import TORCH_SPINS
 from rts.contracts.checks import check_splatter, is_count
 from rts.contracts.records import Sampled
 from rts.errors import InputError

@@ -1,0 +1,21 @@
+"""What `import rts` sets in the process: how threads of torch wait, and how much freed memory is kept."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import numpy as np
+
+TORCH_SPINS = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
+"""Whether torch was imported before rts: its idle OpenMP threads then spin, on cores that loops could use."""
+
+if "OMP_WAIT_POLICY" not in os.environ:
+    # Read where torch is imported, or another user of OpenMP.
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+# The C library of Linux keeps freed memory up to twice the largest block that it has handed back to the system, if that
+# had less than 32 MB. A step of a fit frees some 100 MB; pages that are handed back are cleared anew for the next step.
+np.empty(31 << 20, np.uint8)

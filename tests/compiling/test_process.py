@@ -1,0 +1,35 @@
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.core
+
+PROGRAM = """
+import resource, sys
+import numpy as np
+if "rts" in sys.argv: import rts
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    arrays = [np.ones(3 << 20, np.uint8) for _ in range(10)]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+print([faults() for _ in range(4)][-1])
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="how much is kept is a matter of the C library of Linux")
+def test_memory_of_one_step_serves_the_next():
+    environment = {name: value for name, value in os.environ.items() if "MALLOC" not in name}
+    pages = 30 * 2**20 // os.sysconf("SC_PAGESIZE")
+
+    def faults(*arguments):
+        run = subprocess.run(
+            [sys.executable, "-c", PROGRAM, *arguments], env=environment, capture_output=True, text=True
+        )
+        return int(run.stdout)
+
+    assert faults("rts") < 0.05 * pages < 0.5 * pages < faults()
