@@ -102,9 +102,8 @@ def _wrapped(index, count, wrap):
 
 
 @compiled
-def _found(uv, image, places, wrap_u, wrap_v, nearest, n):
-    """The four texels of lookup n, and the shares of the right and the lower ones."""
-    place = image[n] if len(image) > 0 else 0
+def _found(uv, places, place, wrap_u, wrap_v, nearest, n):
+    """The four texels of lookup n in the image `place`, and the shares of the right and the lower ones."""
     height, width, first = places[place, 0], places[place, 1], places[place, 2]
     real, half = uv.dtype.type, uv.dtype.type(0.5)
     x, y = uv[n, 0] * real(width) - half, (real(1) - uv[n, 1]) * real(height) - half
@@ -131,8 +130,10 @@ def _any(g, n):
 @loop
 def _look_up(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, out):
     """Fill rows [start, stop) of `out` (N, C)."""
+    several = len(image) > 0
     for n in range(start, stop):
-        a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
+        place = image[n] if several else 0
+        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
         for k in range(table.shape[1]):
             upper = table[a, k] + fx * (table[b, k] - table[a, k])
             lower = table[c, k] + fx * (table[d, k] - table[c, k])
@@ -142,9 +143,10 @@ def _look_up(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, out
 @loop
 def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t_uv, out):
     """Add to rows [start, stop) of `out` (N, C) the derivative along `t_uv` (N, 2)."""
+    several = len(image) > 0
     for n in range(start, stop):
-        a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
-        place = image[n] if len(image) > 0 else 0
+        place = image[n] if several else 0
+        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
         right, down = t_uv[n, 0] * places[place, 1], -t_uv[n, 1] * places[place, 0]
         for k in range(table.shape[1]):
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
@@ -155,27 +157,29 @@ def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t
 @loop
 def _pull_uv(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, g, g_uv):
     """Fill rows [start, stop) of `g_uv` (N, 2) from `g` (N, C)."""
+    several = len(image) > 0
     for n in range(start, stop):
         if not _any(g, n):
             continue
-        a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
+        place = image[n] if several else 0
+        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
         right = down = g.dtype.type(0)
         for k in range(table.shape[1]):
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
             right += g[n, k] * (upper + fy * (lower - upper))
             down += g[n, k] * (table[c, k] + fx * lower - table[a, k] - fx * upper)
-        place = image[n] if len(image) > 0 else 0
         g_uv[n, 0], g_uv[n, 1] = right * places[place, 1], -down * places[place, 0]
 
 
 @loop
 def _scatter(uv, image, places, wrap_u, wrap_v, nearest, g, g_table):
     """Add to `g_table` (M, C) the gradient of the texels, from `g` (N, C)."""
-    one = g.dtype.type(1)
+    one, several = g.dtype.type(1), len(image) > 0
     for n in range(len(uv)):
         if not _any(g, n):
             continue
-        a, b, c, d, fx, fy = _found(uv, image, places, wrap_u, wrap_v, nearest, n)
+        place = image[n] if several else 0
+        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
         for k in range(g.shape[1]):
             x = g[n, k]
             g_table[a, k] += (one - fx) * (one - fy) * x

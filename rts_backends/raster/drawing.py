@@ -122,7 +122,7 @@ def _draw(items, geometry, top, end, width, layered):
 
 @compiled
 def _row(b, numbers, i0, count, ra, rb, rc, depths, within):
-    """Fill in depths (count,) and first two barycentrics (2, count) of a triangle in a row; inf where it covers nothing.
+    """Fill in depths (count,) and first two barycentrics (2, count) of a triangle in a row; inf outside of it.
 
     Args:
         b: the triangle in its block; it needs no clipping.

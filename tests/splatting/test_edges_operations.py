@@ -67,7 +67,11 @@ def operands_of(name, operation):
         known = KNOWN[name] = {}
         with pytest.MonkeyPatch.context() as patch:
             for module, own, called in ((splatter, "EDGES", EDGES), (stacks, "CELLS", CELLS)):
-                patch.setattr(module, own, lambda *x, own=own, called=called, **params: called(*known.setdefault(own, x), **params))
+                patch.setattr(
+                    module,
+                    own,
+                    lambda *x, own=own, called=called, **params: called(*known.setdefault(own, x), **params),
+                )
             rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1)
     return list(KNOWN[name][operation])
 
