@@ -18,4 +18,5 @@ if "OMP_WAIT_POLICY" not in os.environ:
 
 # The C library of Linux keeps freed memory up to twice the largest block that it has handed back to the system, if that
 # had less than 32 MB. A step of a fit frees some 100 MB; pages that are handed back are cleared anew for the next step.
+# `MALLOC_TRIM_THRESHOLD_` of the environment overrules it.
 np.empty(31 << 20, np.uint8)
