@@ -46,7 +46,7 @@ def test_samples_and_breaks_cross_by_their_sizes(step):
     assert sums["to the device", "rows of breaks"] == 8 * breaks and sums["to the device", "slopes"] == 16 * breaks
     assert not sums["to the host", "vertices"]  # They are prepared.
     # Operands cross once, for the value and the derivative.
-    assert sums["to the device", "image"] == sums["to the host", "gradient of the image"] == 16 * cells
+    assert sums["to the device", "image"] == sums["to the host", "gradient of the image"] == 16 * SIDE**2
     assert sums["to the device", "gradients of samples"] == 28 * rows
 
 
