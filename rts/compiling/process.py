@@ -16,7 +16,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
     # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-# The C library of Linux keeps freed memory up to twice the largest block that it has handed back to the system, if that
-# had less than 32 MB. A step of a fit frees some 100 MB; pages that are handed back are cleared anew for the next step.
-# `MALLOC_TRIM_THRESHOLD_` of the environment overrules it.
+# Freed memory then serves the next step, whose pages the system would clear anew. glibc learns from the largest block
+# below 32 MB that is freed: smaller ones come from the heap, whose end goes back once twice as much of it is free.
+# `MALLOC_TRIM_THRESHOLD_` of the environment turns this off.
 np.empty(31 << 20, np.uint8)

@@ -66,8 +66,9 @@ class Edges(SummingSplatter):
         return self._image(splats, 0)
 
     def cropped(self, splats: Splats) -> Array:
-        """See `rts.Splatter`; drawn without the border, unless a subclass has an `image` of its own."""
-        return super().cropped(splats) if overrides(self, "image", Edges) else self._image(splats, splats.border)
+        """See `rts.Splatter`; drawn without the border, unless it has an `image` of its own."""
+        own = "image" in vars(self) or overrides(self, "image", Edges)
+        return super().cropped(splats) if own else self._image(splats, splats.border)
 
     def _image(self, splats: Splats, border: int) -> Array:
         """The image without `border` cells at each side."""
