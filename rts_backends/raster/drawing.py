@@ -1,7 +1,8 @@
 """The second pass of the rasterizer: listed triangles drawn into the layers of pixels, a band of rows at a time.
 
 Most innermost loops run over arrays of one short block (a row for each number, a column for each triangle) and have no
-branches, so that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
+branches, so that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last. Where
+one layer is kept, wide triangles are drawn row by row.
 """
 
 from __future__ import annotations

@@ -8,9 +8,6 @@ A second pass draws the image in bands of rows, each by one thread. For blocks o
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that these triangles
 cover, and inserts the triangles into the pixels' layers. The result depends neither on the number of threads nor on the
 order of the list.
-
-The innermost loops run over arrays of one short block (a row for each number, a column for each triangle) and have no
-branches, so that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
 """
 
 from __future__ import annotations

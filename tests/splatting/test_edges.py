@@ -269,3 +269,11 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
             assert np.isfinite(spans).all()
+
+
+def test_an_image_that_is_set_on_a_splatter_is_drawn():
+    splatter = rts.plugin("splatters", "edges")()
+    part, own = card(flat(turned(SQUARE, 0.3, (12.0, 12.0)))), splatter.image
+    expected = 2 * rts.render(part, in_pixels(SIZE), SIZE, splatter=splatter)
+    splatter.image = lambda splats: 2 * own(splats)
+    np.testing.assert_array_equal(rts.render(part, in_pixels(SIZE), SIZE, splatter=splatter), expected)
