@@ -35,7 +35,7 @@ def forward(
 
 def _combine(rows, weights, ids, out, column, count, affine):
     if affine and count == 3:
-        parallel(_interpolate, len(ids), rows, ids, column, weights, out, work=8 * len(ids))
+        parallel(_interpolate, len(ids), rows, ids, column, weights, out, work=6 * len(ids))
     else:
         parallel(_sum, len(ids), rows, ids, column, count, affine, weights, out, work=3 * count * len(ids))
 
@@ -63,7 +63,7 @@ def push(
     if t_weights is None:
         return
     if affine and count == 3:
-        parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out, work=8 * len(ids))
+        parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out, work=6 * len(ids))
     else:
         parallel(_add_sum, len(ids), rows, ids, column, count, affine, t_weights, out, work=3 * count * len(ids))
 

@@ -14,17 +14,17 @@ from rts.compiling.threads import parallel
 
 def forward(x: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, 3) with the vectors x (N, 3), scaled to length one."""
-    parallel(_unit, len(x), x, out, work=7 * len(x))
+    parallel(_unit, len(x), x, out, work=4 * len(x))
 
 
 def push(x: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, 3) with the derivatives of unit vectors along `t` (N, 3)."""
-    parallel(_turn, len(x), x, t, out, work=14 * len(x))
+    parallel(_turn, len(x), x, t, out, work=7 * len(x))
 
 
 def pull(x: np.ndarray, g: np.ndarray, g_x: np.ndarray) -> None:
     """Fill `g_x` (N, 3) with the gradient of the vectors, from that of unit vectors, `g` (N, 3)."""
-    parallel(_turn, len(x), x, g, g_x, work=14 * len(x))
+    parallel(_turn, len(x), x, g, g_x, work=7 * len(x))
 
 
 @compiled

@@ -25,6 +25,7 @@ def found_in_batch(
     centres: Sequence[Fronts],
     inputs: Sequence[Sequence[Tree]],
     most: int | None,
+    uniform: bool,
 ) -> list[tuple[Found, list[Samples]] | None]:
     """Outlines and the samples beside breaks, as of `found_in_views`, of each item of a batch.
 
@@ -34,6 +35,7 @@ def found_in_batch(
         centres: what is seen at their centres.
         inputs: of the proxies of the parts of each, on the host.
         most: the number of breaks that there is room for in each item, if it is limited.
+        uniform: as of `Points.of`.
 
     Returns:
         None for items that cannot be drawn along with others, or have more breaks than there is room for.
@@ -49,12 +51,14 @@ def found_in_batch(
         for first in range(0, len(alike), count):
             chunk = alike[first : first + count]
             together = [view for view in (views[index] for index in chunk) if view is not None]
-            for index, one in zip(chunk, _found_in_picture(together, [centres[i] for i in chunk]), strict=True):
+            for index, one in zip(chunk, _found_in_picture(together, [centres[i] for i in chunk], uniform), strict=True):
                 found[index] = one if most is None or len(one[0].place) <= most else None
     return found
 
 
-def _found_in_picture(views: Sequence[View], centres: Sequence[Fronts]) -> list[tuple[Found, list[Samples]]]:
+def _found_in_picture(
+    views: Sequence[View], centres: Sequence[Fronts], uniform: bool
+) -> list[tuple[Found, list[Samples]]]:
     """Outlines of views that are drawn at once, and the samples of each view's parts."""
     picture = Picture.of(len(views), views[0].grid.size)
     scene, grid = joined(views, picture)
@@ -66,7 +70,7 @@ def _found_in_picture(views: Sequence[View], centres: Sequence[Fronts]) -> list[
         here = np.where(one.part >= 0, one.part + np.int32(first), np.int32(-1))
         part[:, *place], depth[:, *place] = here, one.depth
         triangle[:, *place] = np.where(one.triangle >= 0, one.triangle + starts[here], np.int32(-1))
-    points = Points.of(scene, grid, [None] * len(scene.parts))
+    points = Points.of(scene, grid, [None] * len(scene.parts), uniform)
     (found,), samples = found_in_views([points], [Fronts(part, triangle, depth)])
     of_views = zip(_split(found, picture, firsts), views, firsts, strict=True)
     return [(one, samples[first : first + len(view.proxies)]) for one, view, first in of_views]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_batch import found_in_batch
-from rts.outlines.points import Points, at_centres, found_in_views
+from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -27,7 +27,9 @@ from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 
 
-def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
+def with_outlines(
+    sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None, uniform: bool = False
+) -> Sampled:
     """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
 
     Where light passes through, the outlines are those of all layers that it reaches; else those of the first layer.
@@ -39,6 +41,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
             row and a column of the grid, if that is more, or for fewer if a shared table has no room for their samples.
             `overflow` counts those beyond.
+        uniform: whether each part has one colour, so that no samples need tell it: `Outlines.inner` is then −1.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
@@ -56,10 +59,10 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
+        found, more = _found_on_host(sampled, scene, grid, most, capacity, uniform, inputs)
     else:
         centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
-        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene))], [centres])
+        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), uniform)], [centres])
         specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
@@ -97,13 +100,20 @@ def _without_gaps(whole: Samples, of_cells: Samples, beside: Array) -> Samples:
 
 
 def _found_on_host(
-    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, capacity: int | None, inputs: Tree
+    sampled: Sampled,
+    scene: Scene,
+    grid: Grid,
+    most: int | None,
+    capacity: int | None,
+    uniform: bool,
+    inputs: Tree,
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
     owners, layers = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0]
-    # Where a break has a pair, its last sample is there once more.
-    rows = (columns(layers)[0] + 1) * (most or 0)
-    room = [_rooms(*pair, rows, capacity) for pair in zip(scene.parts, sampled.samples, strict=True)]
+    room = [
+        _Room.of(part, sampler, samples, layers, uniform, most, capacity)
+        for part, sampler, samples in zip(scene.parts, scene.samplers, sampled.samples, strict=True)
+    ]
 
     def entered(arrays: Sequence[np.ndarray]) -> tuple[Scene, Grid, Fronts, list[Tree]]:
         """Scene, cells, what is seen at their centres, and the inputs of proxies, on the host."""
@@ -118,9 +128,9 @@ def _found_on_host(
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         here, own_grid, centres, known = entered(arrays)
-        points, count = Points.of(here, own_grid, known), most
+        points, count = Points.of(here, own_grid, known, uniform), most
         (found,), more = found_in_views([points], [centres], count)
-        while count and not all(map(_has_room, more, room)):
+        while count and not all(own.holds(samples) for own, samples in zip(room, more, strict=True)):
             count //= 2
             (found,), more = found_in_views([points], [centres], count)
         return in_arrays(here.parts, found, more)
@@ -128,7 +138,7 @@ def _found_on_host(
     def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         known = [entered(arrays) for arrays in items]
         scenes, grids, centres, of_proxies = zip(*known, strict=True)
-        batch = found_in_batch(scenes, grids, centres, of_proxies, most)
+        batch = found_in_batch(scenes, grids, centres, of_proxies, most, uniform)
         return [None if one is None else in_arrays(own[0].parts, *one) for own, one in zip(known, batch, strict=True)]
 
     def in_arrays(parts: Sequence[CheckedPart], found: Found, more: Sequence[Samples]) -> list[np.ndarray]:
@@ -143,10 +153,10 @@ def _found_on_host(
 
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
     specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
-    for tables, rooms in zip(owners, room, strict=True):
+    for tables, own in zip(owners, room, strict=True):
         for (kind, name), x in tables.items():
             dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
-            count = rooms.get(name, rows) if kind == "tables" else rows
+            count = own.tables.get(name, own.rows) if kind == "tables" else own.rows
             specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     at_once = all(map(_samples_at_once, scene.parts, scene.samplers))
     call = OnAllCores(host, together) if at_once else host
@@ -160,18 +170,42 @@ def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
     return has_sheets(part, sampler) and isinstance(sampler, TriangleSampler) and sampler.draws_at_once
 
 
-def _rooms(part: CheckedPart, samples: Samples, rows: int, capacity: int | None) -> dict[str, int]:
-    """The numbers of rows, by name, of tables that so many further samples of a part share."""
-    surface, names = part.surface, set(samples.tables) - set(samples.by_sample)
-    if not names or not isinstance(surface, TriangleSurface):
-        return {}
-    specs = surface.table_specs(rows, None if capacity is None else rows)
-    return {name: specs[name].shape[0] for name in names}
+class _Room(NamedTuple):
+    """The room for samples of a part beside breaks.
 
+    Attributes:
+        rows: the largest number of these samples.
+        tables: the numbers of rows, by name, of tables that they share.
+    """
 
-def _has_room(samples: Samples, room: Mapping[str, int]) -> bool:
-    """True if tables have no more rows than there is room for."""
-    return all(samples.tables[name].shape[0] <= count for name, count in room.items())
+    rows: int
+    tables: Mapping[str, int]
+
+    @classmethod
+    def of(
+        cls,
+        part: CheckedPart,
+        sampler: Sampler,
+        samples: Samples,
+        layers: int,
+        uniform: bool,
+        most: int | None,
+        capacity: int | None,
+    ) -> _Room:
+        """Room for the samples of at most so many breaks, in addition to `samples` of the part at centres."""
+        each, surface = columns(layers)[0], part.surface
+        if layers == 1:
+            # The two last samples, and two that tell colours. Where there is a pair, one of the first is there again.
+            each = (2 if uniform else 4) + (3 if has_pairs(part, sampler) else 0)
+        rows, names = each * (most or 0), set(samples.tables) - set(samples.by_sample)
+        if not names or not isinstance(surface, TriangleSurface):
+            return cls(rows, {})
+        specs = surface.table_specs(rows, None if capacity is None else rows)
+        return cls(rows, {name: specs[name].shape[0] for name in names})
+
+    def holds(self, samples: Samples) -> bool:
+        """True if tables have no more rows than there is room for."""
+        return all(samples.tables[name].shape[0] <= count for name, count in self.tables.items())
 
 
 def _tables(samples: Samples) -> dict[tuple[str, str], Array]:

@@ -13,6 +13,7 @@ from rts.arrays.trees import Tree
 from rts.compiling.threads import each
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
+from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Found
@@ -95,14 +96,21 @@ class _Broken(NamedTuple):
 class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
-    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
+    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], uniform: bool):
         """Take of each part its sampler, camera, entry and, where triangles tell all, sheets, shared by joint parts."""
-        self._scene, self._grid, self._parts = scene, grid, parts
+        self._scene, self._grid, self._parts, self._uniform = scene, grid, parts, uniform
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
-        """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree], uniform: bool = False) -> Points:
+        """The points of a grid.
+
+        Args:
+            scene: the scene.
+            grid: its cells.
+            inputs: of each part's proxy, on the host; read where the part has no entry.
+            uniform: whether each part has one colour, so that no samples need tell it.
+        """
         parts, joints = [], {joint.first: joint for joint in scene.joints}
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
@@ -118,7 +126,7 @@ class Points:
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index)
             parts.append((sampler, camera, entry, sheets))
-        return cls(scene, grid, parts)
+        return cls(scene, grid, parts, uniform)
 
     @property
     def entries(self) -> list[Any]:
@@ -148,19 +156,16 @@ class Points:
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
 
-        They are added to the samples of parts. Triangles that stand for no field have no pairs.
+        They are added to the samples of parts.
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
         for index, known in enumerate(self._parts):
-            surface, points, triangles = self._scene.parts[index].surface, breaks.points, breaks.triangles
-            drawn = isinstance(known[0], TriangleSampler)
-            if drawn and not overrides(surface, "refine_outlines", TriangleSurface):
-                continue
+            points, triangles = breaks.points, breaks.triangles
             at = np.flatnonzero(part == index)
-            if not len(at):
+            if not (len(at) and has_pairs(self._scene.parts[index], known[0])):
                 continue
-            ending = at, breaks.near[at]
+            ending, drawn = (at, breaks.near[at]), isinstance(known[0], TriangleSampler)
             fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None
             more = self.sample(index, points[ending], fragments, pairs=True)
             if more.pair is not None:
@@ -192,7 +197,8 @@ class Points:
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
         if count == 1 or stacks is None:
             # For each break the two last samples, and the two that tell colours.
-            parts = np.concatenate([breaks.parts, breaks.parts], 1)
+            inner = np.full_like(breaks.parts, -1) if self._uniform else breaks.parts
+            parts = np.concatenate([breaks.parts, inner], 1)
             points = np.concatenate([breaks.points, breaks.inner], 1)
             return breaks, parts, points, breaks.triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
         parts = np.concatenate([stacks.last, stacks.parts], 1)
@@ -277,6 +283,11 @@ class Points:
             part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
         fronts = Fronts(part, np.full(none, -1, np.int32), np.where(part >= 0, depth, 0.0))
         return _lit(fronts, np.array(scene.opaque))
+
+
+def has_pairs(part: CheckedPart, sampler: Sampler) -> bool:
+    """True if outlines of a part may move as a pair of samples; those of triangles that stand for no field do not."""
+    return not isinstance(sampler, TriangleSampler) or overrides(part.surface, "refine_outlines", TriangleSurface)
 
 
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:

@@ -47,5 +47,5 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     triangle = loops.ending(breaks.near, breaks.parts, breaks.triangles)
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
     filled = origin, ties, square_sides, around, *known, triangle, corner, pull
-    parallel(loops.corners, len(ties), *filled, work=300 * len(ties))
+    parallel(loops.corners, len(ties), *filled, work=150 * len(ties))
     return Segments(origin, ties, square_sides, np.ascontiguousarray(around[:, 1:3]), corner, pull)

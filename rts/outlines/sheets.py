@@ -72,14 +72,14 @@ class Sheets(NamedTuple):
         # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
-        parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
+        parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=4 * len(seen))
         tables, sides = [x.faces for x in proxies or [proxy]], np.zeros(len(faces) + 1, np.int8)
         starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
         beyond = [_beyond(table) for table in tables]
         if proxies is not None:
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
         beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
-        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
+        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))
         planes, keep = near_and_far(camera), camera.kept_sign(cull)
         return cls(first, starts, vertices, faces, beyond, rows, planes, keep, seen, sides)
 
@@ -104,7 +104,7 @@ class Sheets(NamedTuple):
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
         part_range = np.int32(self.parts.start), np.int32(self.parts.stop)
         arguments = *map(read_only, fronts), part_range, *mesh, self.keep != 0, met, joined
-        parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
+        parallel(sheets_loops.seams, height, *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 2) int32 and (N, 6), see `spans_loops.spans_of`; their parts, (N,) int32."""
@@ -114,14 +114,14 @@ class Sheets(NamedTuple):
         parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
         of_triangles = self.faces, self.seen, self.sides, self.keep, close
-        parallel(spans_loops.most_spans, count, *of_triangles, gaps.rows, gaps.columns, most, work=10 * count)
+        parallel(spans_loops.most_spans, count, *of_triangles, gaps.rows, gaps.columns, most, work=40 * count)
         triangles = np.flatnonzero(most)
         most = most[triangles]
         begins = np.cumsum(most) - most
         names, spans = np.full((most.sum(), 2), -1, np.int32), np.empty((most.sum(), 6))
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen
         arguments = triangles, begins, *mesh, *gaps[:3], names, spans
-        parallel(spans_loops.spans_of, len(triangles), *arguments, work=200 * len(names))
+        parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
         part = np.searchsorted(self.starts[1:-1], names[:, 1], side="right") + self.first
         return names, spans, part.astype(np.int32)
 
@@ -132,7 +132,7 @@ class Sheets(NamedTuple):
         count = len(triangle)
         weights, depth = np.empty((count, 2), np.float32), np.empty(count, np.float32)
         arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth
-        parallel(sheets_loops.on_planes, count, *arguments, work=100 * count)
+        parallel(sheets_loops.on_planes, count, *arguments, work=50 * count)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None])
 
     def edges(

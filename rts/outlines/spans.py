@@ -34,7 +34,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     for sheet in sheets:
         sheet.join(fronts, met, joined)
     marks = np.empty_like(joined)
-    parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, marks, work=fronts.part.size)
+    parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, marks, work=fronts.part.size // 2)
     gaps = Gaps.of(marks)
     begins, names, spans, parts = spans_on(gaps, sheets)
     count = len(gaps.gap)

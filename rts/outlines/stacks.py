@@ -65,7 +65,7 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
         for sheet in sheets:
             sheet.join(front, met, joined)
-        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=front.part.size)
+        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=front.part.size // 2)
         marks = marks | wanted
     return np.asarray(marks)
 

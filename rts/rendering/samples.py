@@ -88,14 +88,14 @@ def sampled_scene(
     if scene.cameras and joins and capacity is None and not settings.fronts:
         scene = with_joints(scene, grid)
     # Inside of one colour nothing depends on where a sample lies.
-    uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
-    uniform = uniform and not settings.fronts
-    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines or settings.fronts, uniform=uniform))
+    uniform = one_shader and all(part.uniform for part in scene.parts)
+    same = uniform and outlines and settings.layers == 1 and len(scene.parts) == 1 and not settings.fronts
+    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines or settings.fronts, uniform=same))
     layers = settings.layers
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
         triangle = sampled.triangle if settings.fronts else None
-        sampled = with_outlines(sampled, scene, grid, capacity).replace(triangle=triangle)
+        sampled = with_outlines(sampled, scene, grid, capacity, uniform).replace(triangle=triangle)
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
     return in_engine(sampled, given) if scene.cameras else sampled
 

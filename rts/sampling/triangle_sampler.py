@@ -180,7 +180,9 @@ class TriangleSampler(Sampler):
         refines, moves = surface.refines, surface.refines and surface.refine_moves
         pairs = request.pairs and points is not None and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
-        bounds = SampleBounds(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
+        # Programs of fixed shapes need no room for more than the one row.
+        capacity = 1 if request.uniform and not refines and request.capacity is None else request.capacity
+        bounds = SampleBounds(layers, cells, capacity, size, 2 * cells[1] if pairs else 0)
         tables = bounds.tables(surface) if refines else {}
         beside = {
             **({"incomplete_cells": ArraySpec((), np.int32)} if moves else {}),

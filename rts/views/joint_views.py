@@ -28,7 +28,8 @@ def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSet
     sampled = scene.joints[0].sampled(picture.size, settings.most_layers, settings.finds_outlines)
     if settings.finds_outlines:
         here = Context(engine_of(), np.zeros((), real_of(scene)))
-        sampled = with_outlines(sampled, scene._replace(context=here), grid)
+        uniform = all(part.uniform for part in scene.parts)
+        sampled = with_outlines(sampled, scene._replace(context=here), grid, uniform=uniform)
     sampled = in_engine(sampled, scene)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
     return _by_place(sampled, picture, [len(view.proxies) for view in views])

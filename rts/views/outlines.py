@@ -28,9 +28,10 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     sampled, picture, scenes = views.sampled, views.picture, sampling.scenes
     assert views.counts is not None
     grids = sampling.grids
-    first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]))
+    uniform, none = all(part.uniform for part in scenes[0].parts), [None] * len(scenes[0].parts)
+    first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]), uniform)
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
-    points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, [None] * len(scenes[0].parts)), further)]
+    points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, none, uniform), further)]
     centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
@@ -53,10 +54,10 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
         start += len(order)
     cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)), triangle=None)
     specs = Found.specs(0, grids[0].size, real_of(scenes[0]), len(sampled.row))
-    none = np.zeros((len(found), 1), np.int32)
+    nowhere = np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = outlines_side_by_side(outlines, picture, none, none)
+    joint = outlines_side_by_side(outlines, picture, nowhere, nowhere)
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
     return with_counts(sampled, picture, tuple(counts))
 

@@ -65,7 +65,7 @@ def sorted_list(
     offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
-        parallel(_sort, len(spans), order, rows, spans, places, items, work=8 * len(items))
+        parallel(_sort, len(spans), order, rows, spans, places, items, work=5 * len(items))
     return TriangleList(keep, np.argsort(-sums), offsets, items, rows)
 
 

@@ -74,7 +74,7 @@ class _Weights(NamedTuple):
         known = outlines.square, *geometry, path, share, cell_side, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
-        parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=400 * segments)
+        parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=250 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
         return cls(shown, points, movers, origins, moves, share, cell_side, flux, cells, sides)
@@ -86,7 +86,7 @@ def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
 
     positions, rgba, row, *arrays = operands
     outlines = _effective(Outlines(*arrays))
-    parallel(loops.inside, len(out), border, positions, rgba, row, outlines.joined, out, work=10 * out.size)
+    parallel(loops.inside, len(out), border, positions, rgba, row, outlines.joined, out, work=2 * out.size)
     weights = _Weights.of(outlines)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
     loops.motions(positions, weights.movers, weights.origins, weights.moves, motion)
@@ -103,7 +103,7 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, kept: _
     weights = kept or _Weights.of(outlines)
     t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
     of_cells = rgba, row, outlines.joined, t_positions, t_rgba
-    parallel(loops.push_inside, len(out), border, *of_cells, out, work=10 * out.size)
+    parallel(loops.push_inside, len(out), border, *of_cells, out, work=2 * out.size)
     _push_outlines(operands, (t_positions, t_rgba), outlines, weights, out, border)
 
 
@@ -247,19 +247,13 @@ def _reached(
 
 def _effective(outlines: Outlines) -> Outlines:
     """Outlines without their last rows that have no effect, for which compiled programs have room."""
-    ties, ends = outlines.ties, outlines.ends
-    segments = _count(ties[:, 0] != ties[:, 1])
-    used = ties[:segments], outlines.beyond[:segments]
-    breaks = max(_count(ends.any(axis=1)), *(1 + x.max(initial=-1) for x in used))
-    if breaks == len(ends) and segments == len(ties):
+    from rts.splatting.edges import weights_loops as loops
+
+    breaks, segments = loops.in_use(outlines.ends, outlines.ties, outlines.beyond)
+    if breaks == len(outlines.ends) and segments == len(outlines.ties):
         return outlines
     cut = {name: getattr(outlines, name)[: segments if name in OF_SEGMENTS else breaks] for name in OF_ROWS}
     return replace(outlines, **cut)
-
-
-def _count(marks: np.ndarray) -> int:
-    """The number of rows up to the last that is marked (N,)."""
-    return len(marks) - int(marks[::-1].argmax()) if marks.any() else 0
 
 
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -59,6 +59,20 @@ def weigh_breaks(gap, near, slope, rows, inner, pair, places, shown, points, mov
                 moves[b, i, 2, a] = sign
 
 
+@loop
+def in_use(near_ends, ties, beyond):
+    """The numbers of breaks and of segments up to the last one that has an effect; arguments as of outlines."""
+    segments, breaks = len(ties), len(near_ends)
+    while segments > 0 and ties[segments - 1, 0] == ties[segments - 1, 1]:
+        segments -= 1
+    while breaks > 0 and not (near_ends[breaks - 1, 0] or near_ends[breaks - 1, 1]):
+        breaks -= 1
+    for s in range(segments):
+        for e in range(2):
+            breaks = max(breaks, ties[s, e] + 1, beyond[s, e] + 1)
+    return breaks, segments
+
+
 @compiled
 def _place(x, y, side):
     """A place on a square's sides, clockwise from the upper left corner, 0 to 4."""
