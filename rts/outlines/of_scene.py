@@ -18,7 +18,6 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
 from rts.outlines.gaps import Fronts
-from rts.outlines.of_batch import found_in_batch
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
@@ -28,7 +27,12 @@ from rts.sampling.triangle_sampler import TriangleSampler
 
 
 def with_outlines(
-    sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None, uniform: bool = False
+    sampled: Sampled,
+    scene: Scene,
+    grid: Grid,
+    capacity: int | None = None,
+    uniform: bool = False,
+    most: int | None = None,
 ) -> Sampled:
     """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
 
@@ -38,10 +42,10 @@ def with_outlines(
         sampled: the samples at centres.
         scene: the scene.
         grid: the cells.
-        capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
-            row and a column of the grid, if that is more, or for fewer if a shared table has no room for their samples.
-            `overflow` counts those beyond.
+        capacity: `Request.capacity`. Where values are traced, there is room for `most_breaks`, or for fewer if a shared
+            table has no room for their samples. `overflow` counts those beyond.
         uniform: whether each part has one colour, so that no samples need tell it: `Outlines.inner` is then −1.
+        most: the most breaks to find where values are known; None for all.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
@@ -58,11 +62,11 @@ def with_outlines(
         inputs = stopped((known, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
-        most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, most, capacity, uniform, inputs)
+        room = most_breaks(grid, capacity) if traced else None
+        found, more = _found_on_host(sampled, scene, grid, room, capacity, uniform, inputs)
     else:
         centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
-        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), uniform)], [centres])
+        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), uniform)], [centres], most)
         specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
@@ -85,6 +89,11 @@ def with_outlines(
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+
+
+def most_breaks(grid: Grid, capacity: int | None) -> int:
+    """The number of breaks for which programs of fixed shapes have room, given `Request.capacity`."""
+    return max(8 * sum(grid.size), (capacity or 0) // 4)
 
 
 def _without_gaps(whole: Samples, of_cells: Samples, beside: Array) -> Samples:
@@ -133,17 +142,8 @@ def _found_on_host(
         while count and not all(own.holds(samples) for own, samples in zip(room, more, strict=True)):
             count //= 2
             (found,), more = found_in_views([points], [centres], count)
-        return in_arrays(here.parts, found, more)
-
-    def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
-        known = [entered(arrays) for arrays in items]
-        scenes, grids, centres, of_proxies = zip(*known, strict=True)
-        batch = found_in_batch(scenes, grids, centres, of_proxies, most, uniform)
-        return [None if one is None else in_arrays(own[0].parts, *one) for own, one in zip(known, batch, strict=True)]
-
-    def in_arrays(parts: Sequence[CheckedPart], found: Found, more: Sequence[Samples]) -> list[np.ndarray]:
         arrays_of = []
-        for part, samples, tables in zip(parts, more, owners, strict=True):
+        for part, samples, tables in zip(here.parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = (
                 part.surface.evaluate(part.theta, replace(samples, gbuffer_names=None)) if "gbuffer" in kinds else {}
@@ -159,7 +159,7 @@ def _found_on_host(
             count = own.tables.get(name, own.rows) if kind == "tables" else own.rows
             specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     at_once = all(map(_samples_at_once, scene.parts, scene.samplers))
-    call = OnAllCores(host, together) if at_once else host
+    call = OnAllCores(host) if at_once else host
     results = iter(engine_of(sampled.row, *operands).call_host(call, specs, *operands))
     found = Found(*islice(results, len(Found._fields)))
     return found, [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]

@@ -10,14 +10,14 @@ from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
 from rts.outlines.of_scene import with_outlines
+from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host
 from rts.sampling.joint import with_joints
 from rts.sampling.layer_count import with_all_layers
-from rts.sampling.merging import merge
+from rts.sampling.merging import sampled_parts
 from rts.sampling.prepared import Prepared
-from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -89,29 +89,17 @@ def sampled_scene(
         scene = with_joints(scene, grid)
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and all(part.uniform for part in scene.parts)
-    same = uniform and outlines and settings.layers == 1 and len(scene.parts) == 1 and not settings.fronts
-    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines or settings.fronts, uniform=same))
-    layers = settings.layers
+    same, layers = uniform and outlines and settings.layers == 1 and not settings.fronts, settings.layers
+    request = Request(capacity, triangles=outlines or settings.fronts, uniform=same)
+    sampled = None
+    if outlines and joins and layers != "auto" and not settings.fronts:
+        sampled = sampled_by_one_call(scene, grid, request, layers, uniform)
+    if sampled is not None:
+        return replace(sampled, supersample=factor, apron=settings.apron)
+    taken = partial(sampled_parts, scene, grid, request)
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
         triangle = sampled.triangle if settings.fronts else None
         sampled = with_outlines(sampled, scene, grid, capacity, uniform).replace(triangle=triangle)
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
     return in_engine(sampled, given) if scene.cameras else sampled
-
-
-def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
-    """The samples of all parts, `count` layers of a grid of cells."""
-    tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
-    while number < len(scene.parts):
-        joint = joints.get(number)
-        if joint is not None:
-            tables.append(joint.sampled(grid.size, count, request.triangles))
-            number = joint.stop
-            continue
-        part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
-        camera = scene.local_camera(number, grid)
-        sampled = sampler.sample(part, camera, grid.size, count, replace(request, entry=entry))
-        tables.append(check_samples(sampled, grid.size, sampler))
-        number += 1
-    return merge(tables, count)

@@ -103,7 +103,7 @@ class HostCall:
             theta = {name: part.theta[name] for name in surface.reads(part.theta)}
             self._theta = theta if is_constant(theta) else None
         self._reads = part.reads if isinstance(part, CheckedPart) else None
-        self._attributes = _attribute_specs(surface, self._reads, self._theta, bounds, like)
+        self._attributes = attribute_specs(surface, self._reads, self._theta, bounds, like)
 
     def samples(
         self,
@@ -194,7 +194,7 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
     return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
 
 
-def _attribute_specs(
+def attribute_specs(
     surface: TriangleSurface,
     reads: Sequence[str] | None,
     host_theta: Mapping | None,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rts.arrays.engines import Context, engine_of, floating_bits, is_constant, namespace
-from rts.arrays.trees import collected, map_leaves
+from rts.arrays.trees import Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples
 from rts.contracts.sampler import Sampler
@@ -25,25 +25,43 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     Only entries are added for engines that pad; nothing where values are traced, or several at once, or where a sampler
     has a way of its own.
     """
-    if not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
+    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
         return scene, grid
-    parts, entries, cameras = [], [], []
-    for index, (part, sampler, entry) in enumerate(zip(scene.parts, scene.samplers, scene.entries, strict=True)):
-        # The product that later projects the samples, to the bit.
-        blamed = [] if part.transform is None else [host_value(part.transform)]
-        camera = check_camera(on_host(scene.local_camera(index, grid)), *blamed)
-        if entry is None:
-            assert isinstance(sampler, TriangleSampler)
-            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
-        parts.append(replace(part, theta={}, transform=None))
-        entries.append(entry)
-        cameras.append(camera)
+    here, cells = from_values(scene, grid.size, map_leaves(host_value, values_of(scene, grid)))
     like = scene.context.like
     if like is not None and scene.context.engine.padded(like):
-        return scene._replace(entries=entries), grid
+        return scene._replace(entries=here.entries), grid
+    return here, cells
+
+
+def values_of(scene: Scene, grid: Grid) -> Tree:
+    """What samples of triangles depend on: the camera of the cells; camera, transform and inputs of each part."""
+    of_parts = [
+        # The product that later projects the samples, to the bit.
+        (scene.local_camera(index, grid), part.transform, proxy_inputs(part) if entry is None else None)
+        for index, (part, entry) in enumerate(zip(scene.parts, scene.entries, strict=True))
+    ]
+    return grid.camera, of_parts
+
+
+def from_values(scene: Scene, size: tuple[int, int], values: Tree) -> tuple[Scene, Grid]:
+    """The scene on the host, and its cells, from the values of `values_of`, as NumPy arrays.
+
+    An InputError if a camera makes no image.
+    """
+    entries, cameras, (camera, of_parts) = [], [], values
+    for part, sampler, entry, given in zip(scene.parts, scene.samplers, scene.entries, of_parts, strict=True):
+        seen, transform, inputs = given
+        seen = check_camera(on_host(seen), transform)
+        if entry is None:
+            assert isinstance(sampler, TriangleSampler)
+            entry = entry_of(part, sampler, inputs, seen, size)
+        entries.append(entry)
+        cameras.append(seen)
+    parts = [replace(part, theta={}, transform=None) for part in scene.parts]
     context = Context(engine_of(), np.zeros((), real_of(scene)))
     here = scene._replace(parts=parts, entries=entries, cameras=cameras, context=context)
-    return here, grid._replace(camera=on_host(grid.camera))
+    return here, Grid(on_host(camera), size)
 
 
 def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:

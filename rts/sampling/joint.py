@@ -16,6 +16,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
+from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -84,15 +85,15 @@ class Joint:
         assert isinstance(sampler, TriangleSampler)
         return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler)
 
-    def sampled(self, size: tuple[int, int], layers: int, triangles: bool) -> Sampled:
-        """The samples at the centres of all cells.
+    def sampled(self, size: tuple[int, int], layers: int, triangles: bool, uniform: bool = False) -> Sampled:
+        """The samples at the centres of all cells; with `uniform` one sample stands for all cells of a part.
 
         With `triangles` there are `Cells.triangle`, which count triangles over the parts.
         """
         grid = layers, *size
         fragments = self.sampler.rasterize(self.sampler.prepare(self.proxy), self.camera, size, layers, self.cull)
         covered = check_fragments(fragments, grid, len(self.proxy.faces), self.sampler)
-        sampled = self.lifted(fragments, covered)
+        sampled = self._of_one_row_each(fragments, covered) if uniform else self.lifted(fragments, covered)
         return sampled if triangles else replace(sampled, cells=replace(sampled.cells, triangle=None))
 
     def lifted(self, fragments: Fragments, covered: np.ndarray | None = None) -> Sampled:
@@ -110,13 +111,29 @@ class Joint:
         counts, *of_samples, row, depth = joint_loops.packed_by_part(
             fragments, covered, self.starts, proxy.ids, proxy.corner_params
         )
+        return self._of_parts(counts, *of_samples, Cells(row, depth, ids))
+
+    def _of_one_row_each(self, fragments: Fragments, covered: np.ndarray) -> Sampled:
+        """Samples of fragments (K, H, W) of which one, at the first of its cells, stands for all cells of a part."""
+        from rts.sampling import joint_loops
+
+        row, first = joint_loops.parts_of(fragments.triangle_ids, covered, self.starts)
+        seen, depth = first >= 0, np.where(covered, fragments.depth, np.float32(0))
+        one = Fragments(*(x.reshape(1, 1, row.size, *x.shape[3:])[:, :, first[seen]] for x in fragments))
+        packed = pack_fragments(one, self.proxy)
+        ids, params = (np.zeros((len(seen), x.shape[1]), x.dtype) for x in (packed.ids, packed.params))
+        ids[seen], params[seen] = packed.ids[: seen.sum()], packed.params[: seen.sum()]
+        return self._of_parts(seen, ids, params, Cells(row, depth, fragments.triangle_ids))
+
+    def _of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
+        """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row."""
         ends = np.cumsum(np.maximum(counts, 1))[:-1]
-        tables, none = zip(*(np.split(x, ends) for x in of_samples), counts > 0, strict=True), np.asarray(0, np.int32)
-        samples = []
-        for part, (ids_of_part, params, seen) in zip(self.parts, tables, strict=True):
+        tables = zip(np.split(ids, ends), np.split(params, ends), counts > 0, strict=True)
+        samples, none = [], np.asarray(0, np.int32)
+        for part, (ids_of_part, params_of_part, seen) in zip(self.parts, tables, strict=True):
             used = np.arange(len(ids_of_part), dtype=np.int32)[None, None] - np.int32(not seen)
-            samples.append(Samples(ids_of_part, params, Cells(used), none, gbuffer_names=part.reads))
-        return Sampled(tuple(samples), Cells(row, depth, ids), none)
+            samples.append(Samples(ids_of_part, params_of_part, Cells(used), none, gbuffer_names=part.reads))
+        return Sampled(tuple(samples), cells, none)
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:

@@ -53,6 +53,31 @@ def packed_by_part(
     return counts, ids, params, row, depth
 
 
+def parts_of(triangles: np.ndarray, covered: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part (K, H, W) int32 of each cell, −1 where it is not covered, and the first cell (P,) of each part, or −1.
+
+    Args:
+        triangles: (K, H, W), counted over all parts.
+        covered: (K, H, W) bool, the cells in which there is one.
+        starts: (P + 1,) int32, where the triangles of each part begin.
+    """
+    sizes = np.diff(starts)
+    part_of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    row, first = np.empty(covered.shape, np.int32), np.full(len(sizes), -1, np.int64)
+    triangles, there = read_only(triangles, np.int32).reshape(-1), read_only(covered).reshape(-1)
+    _parts_of(triangles, there, part_of, row.reshape(-1), first)
+    return row, first
+
+
+@loop
+def _parts_of(triangles, there, part_of, row, first):
+    """Fill `row` (M,) and `first` (P,), given as −1; see `parts_of`."""
+    for m in range(len(row)):
+        row[m] = part_of[triangles[m]] if there[m] else -1
+        if there[m] and first[row[m]] < 0:
+            first[row[m]] = m
+
+
 @loop
 def _count(start, stop, bounds, there, triangles, part_of, counts):
     """Add to rows [start, stop) of `counts` (pieces, P) the samples of each part in these pieces of the cells."""

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
+from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples
 from rts.errors import InputError
+from rts.sampling.sample_checks import check_samples
+from rts.sampling.scene import Grid, Scene
+
+
+def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int) -> Sampled:
+    """The samples of all parts at the centres of a grid of cells."""
+    tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
+    while number < len(scene.parts):
+        joint = joints.get(number)
+        if joint is not None:
+            tables.append(joint.sampled(grid.size, layers, request.triangles, request.uniform))
+            number = joint.stop
+            continue
+        part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
+        camera = scene.local_camera(number, grid)
+        sampled = sampler.sample(part, camera, grid.size, layers, replace(request, entry=entry))
+        tables.append(check_samples(sampled, grid.size, sampler))
+        number += 1
+    return merge(tables, layers)
 
 
 def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:

@@ -12,15 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.records import Proxy
+from rts.sampling.cache import Entry
 from rts.sampling.camera_checks import check_camera
-from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
+from rts.sampling.host_scenes import on_the_host
 from rts.sampling.joint import MOST, Joint, is_suited
 from rts.sampling.picture import Picture
 from rts.sampling.points import pixel_widths
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 MARGIN = 1
@@ -47,40 +46,32 @@ class View(NamedTuple):
     kind: tuple
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree] | None = None) -> View | None:
+    def of(cls, scene: Scene, grid: Grid) -> View | None:
         """A view that can be drawn along with others; None for one that has to be drawn by itself.
 
         Its parts must be such as can be `Joint`, of few triangles, all of one sampler. All vertices must lie in it.
-        `inputs` of each part's proxy, on the host, are read where it has no entry; None to make them.
         """
-        sampler, cull, like = scene.samplers[0], scene.parts[0].cull, scene.context.like
-        if not isinstance(sampler, TriangleSampler) or (like is not None and scene.context.engine.padded(like)):
-            return None
+        sampler, cull = scene.samplers[0], scene.parts[0].cull
         for part, chosen_sampler in zip(scene.parts, scene.samplers, strict=True):
             if chosen_sampler is not sampler or part.cull != cull or not is_suited(part, chosen_sampler):
                 return None
-        if not is_known(scene, grid):
+        here, cells = on_the_host(scene, grid)
+        if not here.cameras:
             return None
-        camera = check_camera(on_host(grid.camera))
+        camera = check_camera(cells.camera)
         p = camera.projection
         if p[2, :2].any() or p[3, :2].any() or not (p[0, 0] and p[1, 1]):
             return None
-        proxies, seen, mirrored = [], [], False
-        sign = Camera(np.eye(4), p).kept_sign(cull)
-        for index, (part, entry) in enumerate(zip(scene.parts, scene.entries, strict=True)):
-            local = on_host(scene.local_camera(index, grid).for_size(grid.size))
-            local = check_camera(local, *([] if part.transform is None else [host_value(part.transform)]))
-            if entry is None:
-                arrays = map_leaves(host_value, proxy_inputs(part)) if inputs is None else inputs[index]
-                entry = entry_of(part, sampler, arrays, local, grid.size)
-            if not 0 < len(entry.proxy.faces) <= MOST:
+        proxies, seen, sign = [], [], Camera(np.eye(4), p).kept_sign(cull)
+        for local, entry in zip(here.cameras, here.entries, strict=True):
+            if not 0 < len(entry.proxy.faces) <= MOST or local.kept_sign(cull) != sign:
                 return None
             rows = np.concatenate([p[:2] @ local.view, local.view[2:3]])
-            seen.append(entry.proxy.vertices @ rows[:, :3].T + rows[:, 3])
+            vertices = entry.proxy.vertices @ rows[:, :3].T + rows[:, 3]
+            if not _is_inside(vertices, camera, grid.size):
+                return None
+            seen.append(vertices)
             proxies.append(entry.proxy)
-            mirrored |= local.kept_sign(cull) != sign
-        if mirrored or not all(_is_inside(x, camera, grid.size) for x in seen):
-            return None
         tables = {
             tuple(None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params)) for proxy in proxies
         }
@@ -119,13 +110,12 @@ def joined(views: Sequence[View], picture: Picture) -> tuple[Scene, Grid]:
             vertices.append(
                 np.column_stack([(seen[:, :2] * np.diag(window)[:2] + w * window[:2, 3]) / scale, seen[:, 2]])
             )
-    scenes = [view.scene for view in views]
+    scenes, proxies = [view.scene for view in views], [proxy for view in views for proxy in view.proxies]
     whole = Scene(
         [replace(part, transform=None) for scene in scenes for part in scene.parts],
         camera,
         [sampler for scene in scenes for sampler in scene.samplers],
-        [None] * len(vertices),
+        [Entry(proxy, None) for proxy in proxies],
         scenes[0].context,
     )
-    proxies = [proxy for view in views for proxy in view.proxies]
     return whole._replace(joints=(Joint.seen_from(camera, whole, 0, proxies, vertices),)), Grid(camera, picture.size)

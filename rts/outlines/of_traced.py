@@ -1,0 +1,279 @@
+"""Scenes of traced values: samples and outlines by one call to the host, which samples all parts at once.
+
+Under `vmap` items that show small meshes whole are drawn side by side in one picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.engines import Context, engine_of, is_constant, is_traced, namespace, stopped
+from rts.arrays.trees import Array, leaves, map_leaves
+from rts.compiling.threads import OnAllCores
+from rts.contracts.records import ArraySpec, Cells, Outlines, Request, Sampled, Samples
+from rts.outlines.found import Found
+from rts.outlines.of_scene import most_breaks, with_outlines
+from rts.sampling.entries import is_batched
+from rts.sampling.host_call import SampleBounds, attribute_specs
+from rts.sampling.host_scenes import from_values, real_of, values_of
+from rts.sampling.joint import is_suited, with_joints
+from rts.sampling.merging import sampled_parts
+from rts.sampling.picture import Picture, at_once, renumbered
+from rts.sampling.scene import Grid, Scene
+from rts.sampling.side_by_side import View, joined
+
+OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
+"""The fields of outlines that have a row for each segment."""
+
+OF_ROWS = ("rows", "inner", "pair", "stack")
+"""The fields of outlines that hold rows of samples."""
+
+
+def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, uniform: bool) -> Sampled | None:
+    """The samples of a scene with their outlines, by one call to the host.
+
+    The cells of each part's samples are its rows, one after the other, −1 for those that are not in use. Samples beyond
+    `request.capacity` in a part, and breaks beyond `most_breaks`, are dropped, and counted in `overflow`.
+
+    Args:
+        scene: the scene.
+        grid: the cells.
+        request: what samplers are asked for.
+        layers: K.
+        uniform: as of `with_outlines`.
+
+    Returns:
+        None for values that are known, and where parts cannot be sampled along with others (`is_suited`).
+    """
+    engine = scene.context.engine
+    if scene.cameras or not (engine.differentiates and all(map(is_suited, scene.parts, scene.samplers))):
+        return None
+    values = stopped(values_of(scene, grid))
+    operands = [x for x in leaves(values) if type(x) is not np.ndarray]
+    traced = any(map(is_traced, operands))
+    if not traced and not any(map(is_batched, operands)):
+        return None
+    return _Call(scene, grid, request, layers, uniform, values, traced).sampled()
+
+
+class _Call:
+    """A call to the host: its operands, the shapes of its results, and what it computes.
+
+    Args are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
+    """
+
+    def __init__(
+        self, scene: Scene, grid: Grid, request: Request, layers: int, uniform: bool, values: Any, traced: bool
+    ):
+        self._scene, self._grid, self._layers, self._uniform, self._values = scene, grid, layers, uniform, values
+        self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)
+        self._most = most_breaks(grid, request.capacity) if traced else None
+        self._context, kept = Context(engine_of(), np.zeros((), real_of(scene))), 1 if all(scene.opaque) else layers
+        cells = 1 if request.uniform else layers * grid.size[0] * grid.size[1]
+        beside = 0 if self._most is None else self._most * ((2 if uniform else 4) if layers == 1 else layers + 3)
+        rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
+        # Without fixed shapes there is no bound.
+        self._rows = rows if traced else (2**31 - 1) // len(scene.parts)
+        self._constant = [part.read if is_constant(part.read) else None for part in scene.parts]
+        bounds = SampleBounds(layers, grid.size, self._rows, grid.size)
+        self._attributes = [
+            attribute_specs(part.surface, part.reads, theta, bounds, scene.context.like)
+            for part, theta in zip(scene.parts, self._constant, strict=True)
+        ]
+        self._outlines = _specs(self._most or 0, grid.size, real_of(scene), kept)
+        self._cells = kept, *grid.size
+
+    def sampled(self) -> Sampled:
+        """The samples, in arrays of the scene's engine."""
+        operands = [x for x in leaves(self._values) if type(x) is not np.ndarray]
+        engine = engine_of(*operands)
+        results = iter(engine.call_host(OnAllCores(self._one, self._several), self._specs(), *operands))
+        samples, lengths = [], []
+        for part, attributes in zip(self._scene.parts, self._attributes, strict=True):
+            count, ids, params, *others = (next(results) for _ in range(3 + len(attributes)))
+            xp, length = namespace(ids), ids.shape[-2]
+            every = engine.constant(np.arange(length, dtype=np.int32), ids)
+            own = Cells(xp.where(every < count, every, -1)[None, None, :])
+            gbuffer = dict(zip(attributes, others, strict=True)) or None
+            samples.append(Samples(ids, params, own, 0 * count, gbuffer=gbuffer, gbuffer_names=part.reads))
+            lengths.append(length)
+        row, depth, overflow = (next(results) for _ in range(3))
+        outlines = Outlines(**dict(zip(self._outlines, results, strict=True)))
+        starts = np.arange(len(lengths), dtype=np.int64) * self._rows
+        shifts = np.cumsum([0, *lengths[:-1]]) - starts
+        if shifts.any():
+            starts, shifts = starts[None].astype(np.int32), shifts[None].astype(np.int32)
+            row = renumbered(row, starts, shifts)
+            moved = {
+                name: renumbered(x, starts, shifts) for name in OF_ROWS if (x := getattr(outlines, name)) is not None
+            }
+            outlines = replace(outlines, **moved)
+        return Sampled(tuple(samples), Cells(row, depth), overflow, outlines=outlines)
+
+    def _specs(self) -> list[ArraySpec]:
+        specs = []
+        for part, attributes in zip(self._scene.parts, self._attributes, strict=True):
+            surface: Any = part.surface
+            i, p = surface.sample_widths
+            specs.append(ArraySpec((), np.int32))
+            specs += [ArraySpec((self._rows, i), np.int32, True), ArraySpec((self._rows, p), np.float32, True)]
+            specs += [spec._replace(packed=True) for spec in attributes.values()]
+        specs += [ArraySpec(self._cells, np.int32), ArraySpec(self._cells, np.float32), ArraySpec((), np.int32)]
+        return [*specs, *self._outlines.values()]
+
+    def _entered(self, arrays: Sequence[np.ndarray]) -> tuple[Scene, Grid]:
+        """The scene on the host, and its cells, from operands."""
+        values = iter(arrays)
+        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), self._values)
+        return from_values(self._scene, self._grid.size, known)
+
+    def _one(self, *arrays: np.ndarray) -> list[np.ndarray]:
+        """The results of one item."""
+        scene, grid = self._entered(arrays)
+        scene = with_joints(scene, grid)
+        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers))
+        sampled = with_outlines(sampled, scene, grid, uniform=self._uniform, most=self._most)
+        return self._results([sampled])[0]
+
+    def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
+        """The results of several items; None for those that cannot be drawn along with others, or lack room."""
+        views = [View.of(*self._entered(arrays)) for arrays in items]
+        kinds: dict[tuple, list[int]] = {}
+        for index, view in enumerate(views):
+            if view is not None:
+                kinds.setdefault(view.kind, []).append(index)
+        most, found = at_once(self._grid.size), {}
+        for alike in kinds.values():
+            for first in range(0, len(alike), most):
+                chunk = alike[first : first + most]
+                together = [view for index in chunk if (view := views[index]) is not None]
+                for index, sampled in zip(chunk, self._side_by_side(together), strict=True):
+                    outlines = sampled.outlines
+                    if self._most is None or (outlines is not None and len(outlines.place) <= self._most):
+                        found[index] = sampled
+        results = dict(zip(found, self._results(list(found.values())), strict=True))
+        return [results.get(index) for index in range(len(items))]
+
+    def _side_by_side(self, views: Sequence[View]) -> Iterator[Sampled]:
+        """The samples of each of several views of one kind, drawn in one picture."""
+        picture = Picture.of(len(views), self._grid.size)
+        scene, grid = joined(views, picture)
+        request = self._request
+        sampled = scene.joints[0].sampled(picture.size, self._layers, request.triangles, request.uniform)
+        sampled = with_outlines(
+            self._limited(sampled), scene._replace(context=self._context), grid, uniform=self._uniform
+        )
+        assert sampled.outlines is not None
+        count = len(self._scene.parts)
+        tables = [sampled.samples[first : first + count] for first in range(0, len(sampled.samples), count)]
+        starts = np.cumsum([0, *(sum(len(part.ids) for part in of_view) for of_view in tables)])[:-1]
+        outlines = _split(sampled.outlines, picture)
+        for of_view, start, place, own in zip(tables, starts, picture.places(), outlines, strict=True):
+            row, depth = (x[:, *place] for x in (sampled.row, sampled.depth))
+            rows = {name: getattr(own, name) for name in OF_ROWS}
+            own = replace(own, **{name: None if x is None else _moved(x, -start) for name, x in rows.items()})
+            yield replace(sampled, samples=of_view, cells=Cells(_moved(row, -start), depth), outlines=own)
+
+    def _limited(self, sampled: Sampled) -> Sampled:
+        """Samples at centres, at most `capacity` of each part; those of the last layers are left out."""
+        capacity, counts = self._capacity, [len(samples.ids) for samples in sampled.samples]
+        if capacity is None or max(counts) <= capacity:
+            return sampled
+        starts = np.cumsum([0, *counts])
+        place, kept, start = np.full(starts[-1] + 1, -1, np.int32), [], 0
+        for first, samples in zip(starts, sampled.samples, strict=False):
+            count = min(len(samples.ids), capacity)
+            place[first : first + count] = np.arange(start, start + count)
+            start += count
+            own = samples.row[..., :count] if len(samples.row[0]) == 1 else samples.row
+            kept.append(samples.replace(ids=samples.ids[:count], params=samples.params[:count], row=own))
+        row = place[sampled.row]
+        left = np.asarray(np.count_nonzero((sampled.row >= 0) & (row < 0)), np.int32)
+        cells = Cells(row, np.where(row >= 0, sampled.depth, np.float32(0)), np.where(row >= 0, sampled.triangle, -1))
+        return replace(sampled, samples=tuple(kept), cells=cells, overflow=sampled.overflow + left)
+
+    def _results(self, items: Sequence[Sampled]) -> list[list[np.ndarray]]:
+        """The results of items: for each part a count, tables and attributes, then cells, overflow and outlines."""
+        attributes = [self._attributes_of(index, items) for index in range(len(self._scene.parts))]
+        found = []
+        for b, sampled in enumerate(items):
+            results, sizes = [], [len(samples.ids) for samples in sampled.samples]
+            for samples, of_part in zip(sampled.samples, attributes, strict=True):
+                unused = len(samples.ids) == 1 and not (np.asarray(samples.row) >= 0).any()
+                results += [np.int32(len(samples.ids) - unused), samples.ids, samples.params, *of_part[b]]
+            shifts = np.arange(len(sizes)) * self._rows - np.cumsum([0, *sizes[:-1]])
+            moved = np.append(np.arange(sum(sizes)) + np.repeat(shifts, sizes), -1).astype(np.int32)
+            outlines: Any = sampled.outlines
+            arrays = {name: getattr(outlines, name) for name in self._outlines}
+            if len(sizes) > 1:
+                arrays |= {name: moved[arrays[name]] for name in OF_ROWS if name in arrays}
+            row = sampled.row if len(sizes) == 1 else moved[sampled.row]
+            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *arrays.values()]
+            found.append(results)
+        return found
+
+    def _attributes_of(self, index: int, items: Sequence[Sampled]) -> list[list[np.ndarray]]:
+        """The attributes of a part whose θ is constant, for each item."""
+        theta, specs, part = self._constant[index], self._attributes[index], self._scene.parts[index]
+        tables = [sampled.samples[index] for sampled in items]
+        if theta is None or not tables:
+            return [[] for _ in tables]
+        first = replace(
+            tables[0],
+            ids=np.concatenate([table.ids for table in tables]),
+            params=np.concatenate([table.params for table in tables]),
+            gbuffer_names=None,
+        )
+        gbuffer = part.surface.evaluate(theta, first)
+        ends = np.cumsum([len(table.ids) for table in tables])[:-1]
+        split = [np.split(np.asarray(gbuffer[name], spec.dtype), ends) for name, spec in specs.items()]
+        return [list(of_item) for of_item in zip(*split, strict=True)]
+
+
+def _specs(most: int, size: tuple[int, int], real: Any, layers: int) -> dict[str, ArraySpec]:
+    """Specs of the fields of outlines of at most so many breaks, each of which ends at most two segments."""
+    of_found = dict(zip(Found._fields, Found.specs(most, size, real, layers), strict=True))
+    rows = ArraySpec((most, 2), np.int32, packed=True)
+    specs = {"rows": rows, "inner": rows, "pair": rows}
+    if layers > 1:
+        stack = most, 2, layers
+        specs |= {"stack": ArraySpec(stack, np.int32, packed=True), "stack_points": ArraySpec(stack, real, packed=True)}
+    names = [field.name for field in fields(Outlines)]
+    specs |= {name: spec for name, spec in of_found.items() if name in names and name not in specs}
+    return specs
+
+
+def _moved(rows: Array, shift: int) -> np.ndarray:
+    """Indices of rows that have moved; −1 stays."""
+    return np.where(rows >= 0, rows + np.int32(shift), np.int32(-1))
+
+
+def _split(outlines: Outlines, picture: Picture) -> list[Outlines]:
+    """The outlines of each view of a picture, on the host; none lies in two views."""
+    (height, width), corners = picture.view, picture.corners()[:, ::-1]
+    of_break, of_segment = (
+        x[:, 0] // height * picture.across + x[:, 1] // width for x in (outlines.gap, outlines.square)
+    )
+    breaks, segments = (np.argsort(x, kind="stable") for x in (of_break, of_segment))
+    per_view = [np.bincount(x, minlength=picture.views) for x in (of_break, of_segment)]
+    counts, ends = map(np.cumsum, per_view)
+    number = np.empty(len(breaks) + 1, np.int32)
+    number[breaks] = np.arange(len(breaks)) - (counts - per_view[0])[of_break[breaks]]
+    number[-1] = -1
+    gap, square = np.array(outlines.gap), outlines.square - corners[of_segment]
+    gap[:, :2] -= corners[of_break]
+    moved = {"gap": gap, "square": square, "ties": number[outlines.ties], "beyond": number[outlines.beyond]}
+    split = {}
+    for name in (field.name for field in fields(outlines)):
+        whole = moved.get(name, getattr(outlines, name))
+        if name != "joined" and whole is not None:
+            order, bounds = (segments, ends) if name in OF_SEGMENTS else (breaks, counts)
+            split[name] = np.split(whole[order], bounds[:-1])
+    return [
+        Outlines(**{name: x[b] for name, x in split.items()}, joined=outlines.joined[:, *place])
+        for b, place in enumerate(picture.places())
+    ]
