@@ -4,12 +4,14 @@
     python -m benchmarks.many_parts --parts 10 100 --links 11
     python -m benchmarks.many_parts --parts --scenes 16
     python -m benchmarks.many_parts --parts --poses 64
+    python -m benchmarks.many_parts --parts --programs 1 10 30
 
 A part is a closed cylinder of 512 faces, with a matrix of its own, seen as a silhouette. Both ways take turns in one
 run; memory is the most that one step takes. With `--links`, a chain of so many parts is fitted by Levenberg–Marquardt.
 With `--scenes`, so many meshes of 320 to 2,700 faces are rendered, each by a camera of its own: by one call of
 `rts.render_views`, and by a loop of `rts.render`. With `--poses`, the losses and gradients of so many poses of a mesh
-of 320 faces are computed with jax, by a loop over `jit` and by `jit(vmap)`.
+of 320 faces are computed with jax, by a loop over `jit` and by `jit(vmap)`. With `--programs`, images and gradients of
+parts are computed by programs of jax, with `--capacity` rows a part.
 """
 
 from __future__ import annotations
@@ -198,6 +200,30 @@ def poses(count: int, side: int = 64, rounds: int = 15) -> None:
         print(f"| {name} | {wall:.0f} | {cpu:.0f} |", flush=True)
 
 
+def programs(counts: Sequence[int], capacity: int | None, rounds: int = 12) -> None:
+    """Print the times of programs of jax that render parts, and take the gradient in their poses."""
+    import jax
+
+    vertices, faces = link()
+    surface = rts.Mesh(faces)
+    print("\n| parts | silhouettes, ms | lambert, ms |\n| --- | --- | --- |")
+    for count in counts:
+        row, known = [], jax.numpy.asarray(poses_of(count).numpy())
+        for shader in ("silhouette", "lambert"):
+
+            def loss(poses: jax.Array, shader: str = shader) -> jax.Array:
+                parts = [rts.Part(surface, {"vertices": vertices}, shader, transform=rts.rigid(pose)) for pose in poses]
+                return (rts.render(parts, CAMERA, (SIDE, SIDE), capacity=capacity) ** 2).mean()
+
+            step, times = jax.jit(jax.value_and_grad(loss)), []
+            for _ in range(rounds + 2):
+                start = time.perf_counter()
+                jax.block_until_ready(step(known))
+                times.append(time.perf_counter() - start)
+            row.append(f"{1e3 * np.median(times[2:]):.1f}")
+        print(f"| {count} | {' | '.join(row)} |", flush=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", type=int, default=PARTS)
@@ -205,6 +231,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--links", type=int, default=0)
     parser.add_argument("--scenes", type=int, default=0)
     parser.add_argument("--poses", type=int, default=0)
+    parser.add_argument("--programs", nargs="*", type=int, default=())
+    parser.add_argument("--capacity", type=int)
     args = parser.parse_args(arguments)
     print(f"| parts | each, ms | merged, ms | ratio | each, MB | merged, MB |\n{'| --- ' * 6}|")
     for count in args.parts:
@@ -220,6 +248,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         batches(args.scenes)
     if args.poses:
         poses(args.poses)
+    if args.programs:
+        programs(args.programs, args.capacity)
 
 
 if __name__ == "__main__":

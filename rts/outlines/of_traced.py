@@ -78,11 +78,12 @@ class _Call:
         rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
         # Without fixed shapes there is no bound.
         self._rows = rows if traced else (2**31 - 1) // len(scene.parts)
+        self._surfaces: list[Any] = [part.surface for part in scene.parts]
         self._constant = [part.read if is_constant(part.read) else None for part in scene.parts]
         bounds = SampleBounds(layers, grid.size, self._rows, grid.size)
         self._attributes = [
-            attribute_specs(part.surface, part.reads, theta, bounds, scene.context.like)
-            for part, theta in zip(scene.parts, self._constant, strict=True)
+            attribute_specs(surface, part.reads, theta, bounds, scene.context.like)
+            for part, surface, theta in zip(scene.parts, self._surfaces, self._constant, strict=True)
         ]
         self._outlines = _specs(self._most or 0, grid.size, real_of(scene), kept)
         self._cells = kept, *grid.size
@@ -116,8 +117,7 @@ class _Call:
 
     def _specs(self) -> list[ArraySpec]:
         specs = []
-        for part, attributes in zip(self._scene.parts, self._attributes, strict=True):
-            surface: Any = part.surface
+        for surface, attributes in zip(self._surfaces, self._attributes, strict=True):
             i, p = surface.sample_widths
             specs.append(ArraySpec((), np.int32))
             specs += [ArraySpec((self._rows, i), np.int32, True), ArraySpec((self._rows, p), np.float32, True)]
@@ -202,13 +202,16 @@ class _Call:
         found = []
         for b, sampled in enumerate(items):
             results, sizes = [], [len(samples.ids) for samples in sampled.samples]
-            for samples, of_part in zip(sampled.samples, attributes, strict=True):
-                unused = len(samples.ids) == 1 and not (np.asarray(samples.row) >= 0).any()
-                results += [np.int32(len(samples.ids) - unused), samples.ids, samples.params, *of_part[b]]
-            shifts = np.arange(len(sizes)) * self._rows - np.cumsum([0, *sizes[:-1]])
-            moved = np.append(np.arange(sum(sizes)) + np.repeat(shifts, sizes), -1).astype(np.int32)
             outlines: Any = sampled.outlines
             arrays = {name: getattr(outlines, name) for name in self._outlines}
+            beside = np.concatenate([arrays[name].reshape(-1) for name in OF_ROWS if name in arrays])
+            owners = np.searchsorted(np.cumsum(sizes), beside[beside >= 0], side="right")
+            named = np.bincount(owners, minlength=len(sizes)) > 0
+            for samples, of_part, is_named in zip(sampled.samples, attributes, named.tolist(), strict=True):
+                seen = is_named or (samples.row >= 0).any()  # Else the rows are there so that tables are not empty.
+                results += [np.int32(len(samples.ids) if seen else 0), samples.ids, samples.params, *of_part[b]]
+            shifts = np.arange(len(sizes)) * self._rows - np.cumsum([0, *sizes[:-1]])
+            moved = np.append(np.arange(sum(sizes)) + np.repeat(shifts, sizes), -1).astype(np.int32)
             if len(sizes) > 1:
                 arrays |= {name: moved[arrays[name]] for name in OF_ROWS if name in arrays}
             row = sampled.row if len(sizes) == 1 else moved[sampled.row]
@@ -218,7 +221,7 @@ class _Call:
 
     def _attributes_of(self, index: int, items: Sequence[Sampled]) -> list[list[np.ndarray]]:
         """The attributes of a part whose θ is constant, for each item."""
-        theta, specs, part = self._constant[index], self._attributes[index], self._scene.parts[index]
+        theta, specs = self._constant[index], self._attributes[index]
         tables = [sampled.samples[index] for sampled in items]
         if theta is None or not tables:
             return [[] for _ in tables]
@@ -228,7 +231,7 @@ class _Call:
             params=np.concatenate([table.params for table in tables]),
             gbuffer_names=None,
         )
-        gbuffer = part.surface.evaluate(theta, first)
+        gbuffer = self._surfaces[index].evaluate(theta, first)
         ends = np.cumsum([len(table.ids) for table in tables])[:-1]
         split = [np.split(np.asarray(gbuffer[name], spec.dtype), ends) for name, spec in specs.items()]
         return [list(of_item) for of_item in zip(*split, strict=True)]

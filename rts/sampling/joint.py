@@ -108,10 +108,10 @@ class Joint:
         ids, proxy = fragments.triangle_ids, self.proxy
         covered = ids >= 0 if covered is None else covered
         assert proxy.ids is not None
-        counts, *of_samples, row, depth = joint_loops.packed_by_part(
+        counts, ids_of_parts, params, row, depth = joint_loops.packed_by_part(
             fragments, covered, self.starts, proxy.ids, proxy.corner_params
         )
-        return self._of_parts(counts, *of_samples, Cells(row, depth, ids))
+        return self._of_parts(counts, ids_of_parts, params, Cells(row, depth, ids))
 
     def _of_one_row_each(self, fragments: Fragments, covered: np.ndarray) -> Sampled:
         """Samples of fragments (K, H, W) of which one, at the first of its cells, stands for all cells of a part."""

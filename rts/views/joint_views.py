@@ -25,10 +25,11 @@ def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSet
     scene, grid = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
-    sampled = scene.joints[0].sampled(picture.size, settings.most_layers, settings.finds_outlines)
-    if settings.finds_outlines:
+    outlines, layers, uniform = settings.finds_outlines, settings.most_layers, all(part.uniform for part in scene.parts)
+    same = uniform and outlines and layers == 1 and not settings.fronts
+    sampled = scene.joints[0].sampled(picture.size, layers, outlines, same)
+    if outlines:
         here = Context(engine_of(), np.zeros((), real_of(scene)))
-        uniform = all(part.uniform for part in scene.parts)
         sampled = with_outlines(sampled, scene._replace(context=here), grid, uniform=uniform)
     sampled = in_engine(sampled, scene)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)

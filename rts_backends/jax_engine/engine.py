@@ -101,7 +101,7 @@ class JaxEngine(Engine):
                 raise
 
         def counted(results: Sequence) -> list[np.ndarray | np.generic]:
-            return [*results, np.int32(max((len(results[i]) for i in packed), default=0))]
+            return [*results, np.array([len(results[i]) for i in packed], np.int32)]
 
         def one(*operands: Any) -> list[np.ndarray | np.generic]:
             return counted(noticed(fn, *operands))
@@ -111,9 +111,10 @@ class JaxEngine(Engine):
 
         many: Any = getattr(fn, "many", None)
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        *results, used = host.call(one, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args, many=many and together)
-        for i in packed:
-            self._used.note(results[i], used)
+        counts = jax.ShapeDtypeStruct((len(packed),), np.int32)
+        *results, used = host.call(one, (*shapes, counts), *args, many=many and together)
+        for number, i in enumerate(packed):
+            self._used.note(results[i], used[number])
         return tuple(results)
 
     def traced(self, x: jax.Array) -> bool:
