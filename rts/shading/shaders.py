@@ -122,16 +122,17 @@ class Unlit(Shader):
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
         """The base colour (N, 3), not premultiplied, and its alpha (N, 1): a product, see the top of this file."""
         position = gbuffer["position"]
-        color = alpha = namespace(position).ones_like(position[:, :1])
+        # One row stands for all until some entry differs from sample to sample.
+        xp, count = namespace(position), position.shape[0]
+        color = alpha = xp.ones_like(position[:1, :1])
         for base in self._bases(theta, gbuffer):
             color = color * (base[:, :3] if base.shape[1] >= 3 else base[:, :1])
             alpha = alpha * base[:, 3:] if base.shape[1] == 4 else alpha
-        color = color if color.shape[1] == 3 else color * namespace(position).ones_like(position)
         if "color" in theta:
             factor = entry_of(theta, "color", (3,), (4,))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
-        return color, alpha
+        return xp.broadcast_to(color, (count, 3)), xp.broadcast_to(alpha, (count, 1))
 
     def _bases(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> Iterator[Array]:
         """The texture and the surface's colours at the samples (N, C), as far as there are any."""
@@ -239,10 +240,10 @@ def is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
 
 def positive(x: Array) -> Array:
     """The array with zeros in place of negative numbers, which have no derivative there."""
-    return namespace(x).where(x > 0, x, 0 * x)  # NaN stays NaN.
+    return namespace(x).where(x <= 0, 0.0, x)  # NaN stays NaN.
 
 
 def _opaque(color: Array) -> Array:
     """(N, 4): colours (N, 3) with an alpha of 1."""
     xp = namespace(color)
-    return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
+    return xp.concat([color, xp.broadcast_to(xp.ones_like(color[:1, :1]), (color.shape[0], 1))], axis=1)
