@@ -73,22 +73,29 @@ def with_outlines(
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, moved, first = namespace(found.rows), [], [], 0
     for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        moved.append(first + of_cells.ids.shape[-2])
-        whole = in_one_table([of_cells, extra])
+        behind = 0 if _is_unused(of_cells) else of_cells.ids.shape[-2]
+        moved.append(first + behind)
+        whole = in_one_table([of_cells, extra]) if behind else replace(extra, cells=of_cells.cells)
         if engine_of(whole.ids).padded(whole.ids):
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
     rows = found.rows
-    behind: Any = moved[0]
+    starts: Any = moved[0]
     if len(moved) > 1:
         owners = xp.reshape(xp.clip(found.parts, 0), (-1,))
-        behind = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
-        behind = xp.reshape(behind, rows.shape)
-    rows = xp.where(rows >= 0, rows + behind, rows)
+        starts = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
+        starts = xp.reshape(starts, rows.shape)
+    rows = xp.where(rows >= 0, rows + starts, rows)
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+
+
+def _is_unused(samples: Samples) -> bool:
+    """True for samples of which no cell names the one row, which is there so that the table is not empty."""
+    row = samples.row
+    return type(row) is np.ndarray and samples.ids.shape[-2] == 1 and row.max(initial=-1) < 0
 
 
 def most_breaks(grid: Grid, capacity: int | None) -> int:

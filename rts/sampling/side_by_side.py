@@ -75,6 +75,8 @@ class View(NamedTuple):
         tables = {
             tuple(None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params)) for proxy in proxies
         }
+        if len(tables) > 1:
+            return None
         widths = tuple(f"{x:.5g}" for x in pixel_widths(camera, grid.size))
         kind = id(sampler), cull, sign, widths, p[3].tobytes(), grid.size, *tables
         return cls(scene, grid, camera, proxies, seen, kind)

@@ -237,3 +237,56 @@ def test_transforms_that_make_no_image_are_blamed():
 
     with pytest.raises(Exception, match="the transform of a part holds NaN or infinity"):
         jax.block_until_ready(jax.jit(image)(jax.numpy.asarray(good * np.nan)))
+
+
+class Facing(rts.Shader):
+    """Colours from normals that it makes unit vectors itself: NaN where a normal is zero."""
+
+    opaque = True
+
+    def __call__(self, theta, gbuffer, camera):
+        """Scale normals, and append an alpha of 1."""
+        normal = gbuffer["normal"]
+        xp = normal.__array_namespace__() if hasattr(normal, "__array_namespace__") else torch
+        scaled = normal / (normal * normal).sum(-1)[:, None] ** 0.5
+        return xp.concatenate([0.5 + 0.5 * scaled, 1 + 0 * scaled[:, :1]], -1)
+
+
+@pytest.mark.parametrize("engine", ["torch", "torch vmap", "jax jit"])
+def test_what_no_centre_sees_is_shaded_at_its_own_samples_alone(engine):
+    # No face names the first vertex, so that its normal is zero; the sliver lies between two columns of centres.
+    vertices = np.array([[0, 0, 0], [0, -1, 0], [0.01, 1, 0], [0, 1, 0]], np.float32) + np.float32([0.12326552, 0, 0])
+    camera, pose = rts.Camera.look_at((0, 0, 3.4), (0, 0, 0), fov_y=50), np.full(6, 1e-4, np.float32)
+    sliver = rts.Mesh([[1, 2, 3]])
+
+    def loss(pose):
+        part = rts.Part(sliver, {"vertices": vertices}, Facing(), transform=rts.rigid(pose))
+        return (rts.render(part, camera, SIZE) ** 2).sum()
+
+    sampled = rts.sample(rts.Part(sliver, {"vertices": vertices}, Facing()), camera, SIZE)
+    assert (sampled.row < 0).all() and (sampled.outlines.rows >= 0).any()
+    if engine == "jax jit":
+        jax = pytest.importorskip("jax")
+        slope = np.asarray(jax.jit(jax.grad(loss))(jax.numpy.asarray(pose)))
+    elif engine == "torch":
+        slope = torch.func.grad(loss)(torch.tensor(pose)).numpy()
+    else:
+        slope = torch.func.vmap(torch.func.grad(loss))(torch.tensor(pose)[None])[0].numpy()
+    assert np.isfinite(slope).all() and np.abs(slope).max() > 1
+
+
+def test_parts_whose_tables_differ_in_width_are_taken_one_by_one(items):
+    (ball, faces), random = icosphere(1, 0.4), np.random.default_rng(0)
+    ball, texture = ball.astype(np.float32), random.random((8, 8, 3)).astype(np.float32)
+    uv, index = random.random((7, 2)).astype(np.float32), random.integers(0, 7, faces.shape)
+
+    def image(pose):
+        theta = {"vertices": ball, "uv": uv, "texture": texture}
+        first = rts.Part(rts.Mesh(faces, {"uv": index}), theta, "textured", transform=rts.rigid(pose))
+        second = rts.Part(rts.Mesh(faces), {"vertices": ball + np.float32([0.5, 0, 0])}, "lambert")
+        return rts.render([first, second], CAMERA, SIZE)
+
+    poses = torch.tensor(POSES[:2], dtype=torch.float32)
+    together = torch.func.vmap(image)(poses)
+    assert items == [0]
+    torch.testing.assert_close(together, torch.stack([image(p) for p in poses]), rtol=0, atol=2e-6)
