@@ -182,7 +182,7 @@ class Request:
         pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
             move.
         triangles: whether to record `Cells.triangle`.
-        uniform: whether all samples look alike, so that one row may stand for all cells.
+        uniform: whether all samples of the part look alike, so that one row may stand for all cells.
         entry: the result of `Sampler.prepare_part` for this part; None where nothing was prepared.
     """
 
@@ -192,6 +192,13 @@ class Request:
     triangles: bool = False
     uniform: bool = False
     entry: Any = None
+
+
+OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
+"""The fields of `Outlines` that have a row for each segment."""
+
+OF_SAMPLES = ("rows", "inner", "pair", "stack")
+"""The fields of `Outlines` that hold indices of samples."""
 
 
 @record()
@@ -209,7 +216,8 @@ class Outlines:
             as they do.
         points: (B, 2) float64, the places of these samples along the gap.
         inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
-            colours: in the last hair before an outline normals may turn away, and colours with them.
+            colours: in the last hair before an outline normals may turn away, and colours with them. All are −1 where
+            each part has one colour.
         pair: (B, 2) int32, indices of two samples on the ray of the last sample of the surface that ends, beside its
             deepest point, or −1: the break moves as their mean (`RaySurface.deepest`). A single sample does not tell
             how a kink of a field moves.
@@ -252,6 +260,11 @@ class Outlines:
     stack: Array | None = None
     stack_points: Array | None = None
 
+    def with_rows(self, f: Callable[[Array], Array]) -> Outlines:
+        """The outlines with `f` applied to all indices of samples: (B, 2), and (B, 2, K) of stacks."""
+        indices = {name: getattr(self, name) for name in OF_SAMPLES}
+        return replace(self, **{name: f(x) for name, x in indices.items() if x is not None})
+
 
 @record(static=("supersample", "apron"))
 class Sampled(_OnCells):
@@ -267,8 +280,8 @@ class Sampled(_OnCells):
             Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        outlines: outlines between centres, for splatters that read them, or None. Their samples are the last rows of
-            each part.
+        outlines: outlines between centres, for splatters that read them, or None. Their samples are rows of each part
+            behind those of cells.
     """
 
     samples: tuple[Samples, ...]

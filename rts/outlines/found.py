@@ -17,8 +17,9 @@ class Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 6) int32, for each break the two last samples, the two that tell colours, and the pair, counted in
-            their part. Of K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
+        rows: (B, 6) int32, for each break the two last samples, the two that tell colours (−1 where each part has
+            one), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last samples, and those of
+            the stack there.
         parts: of the shape of `rows`, int32, their parts, or −1.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
         places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.

@@ -75,7 +75,7 @@ def with_outlines(
     for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         behind = 0 if _is_unused(of_cells) else of_cells.ids.shape[-2]
         moved.append(first + behind)
-        whole = in_one_table([of_cells, extra]) if behind else replace(extra, cells=of_cells.cells)
+        whole = in_one_table([of_cells, extra]) if behind else _with_rows_of(of_cells, extra)
         if engine_of(whole.ids).padded(whole.ids):
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
@@ -93,9 +93,14 @@ def with_outlines(
 
 
 def _is_unused(samples: Samples) -> bool:
-    """True for samples of which no cell names the one row, which is there so that the table is not empty."""
-    row = samples.row
-    return type(row) is np.ndarray and samples.ids.shape[-2] == 1 and row.max(initial=-1) < 0
+    """True if a table (1, I), of NumPy, has only the row that is there so that it is not empty: no cell names it."""
+    known = type(samples.row) is np.ndarray and type(samples.ids) is np.ndarray
+    return known and samples.ids.shape[-2] == 1 and samples.row.max(initial=-1) < 0
+
+
+def _with_rows_of(samples: Samples, others: Samples) -> Samples:
+    """Samples with the rows of others in place of their own; cells and all else stay."""
+    return replace(samples, ids=others.ids, params=others.params, tables=others.tables, gbuffer=others.gbuffer)
 
 
 def most_breaks(grid: Grid, capacity: int | None) -> int:

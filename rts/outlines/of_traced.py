@@ -1,4 +1,4 @@
-"""Scenes of traced values: samples and outlines by one call to the host, which samples all parts at once.
+"""Scenes of traced or batched values: samples and outlines by one call to the host, which samples all parts at once.
 
 Under `vmap` items that show small meshes whole are drawn side by side in one picture.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from rts.arrays.engines import Context, engine_of, is_constant, is_traced, namespace, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
-from rts.contracts.records import ArraySpec, Cells, Outlines, Request, Sampled, Samples
+from rts.contracts.records import OF_SAMPLES, OF_SEGMENTS, ArraySpec, Cells, Outlines, Request, Sampled, Samples
 from rts.outlines.found import Found
 from rts.outlines.of_scene import most_breaks, with_outlines
 from rts.sampling.entries import is_batched
@@ -25,12 +26,6 @@ from rts.sampling.merging import sampled_parts
 from rts.sampling.picture import Picture, at_once, renumbered
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import View, joined
-
-OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
-"""The fields of outlines that have a row for each segment."""
-
-OF_ROWS = ("rows", "inner", "pair", "stack")
-"""The fields of outlines that hold rows of samples."""
 
 
 def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, uniform: bool) -> Sampled | None:
@@ -109,10 +104,7 @@ class _Call:
         if shifts.any():
             starts, shifts = starts[None].astype(np.int32), shifts[None].astype(np.int32)
             row = renumbered(row, starts, shifts)
-            moved = {
-                name: renumbered(x, starts, shifts) for name in OF_ROWS if (x := getattr(outlines, name)) is not None
-            }
-            outlines = replace(outlines, **moved)
+            outlines = outlines.with_rows(lambda rows: renumbered(rows, starts, shifts))
         return Sampled(tuple(samples), Cells(row, depth), overflow, outlines=outlines)
 
     def _specs(self) -> list[ArraySpec]:
@@ -174,8 +166,7 @@ class _Call:
         outlines = _split(sampled.outlines, picture)
         for of_view, start, place, own in zip(tables, starts, picture.places(), outlines, strict=True):
             row, depth = (x[:, *place] for x in (sampled.row, sampled.depth))
-            rows = {name: getattr(own, name) for name in OF_ROWS}
-            own = replace(own, **{name: None if x is None else _moved(x, -start) for name, x in rows.items()})
+            own = own.with_rows(partial(_moved, shift=-start))
             yield replace(sampled, samples=of_view, cells=Cells(_moved(row, -start), depth), outlines=own)
 
     def _limited(self, sampled: Sampled) -> Sampled:
@@ -203,8 +194,7 @@ class _Call:
         for b, sampled in enumerate(items):
             results, sizes = [], [len(samples.ids) for samples in sampled.samples]
             outlines: Any = sampled.outlines
-            arrays = {name: getattr(outlines, name) for name in self._outlines}
-            beside = np.concatenate([arrays[name].reshape(-1) for name in OF_ROWS if name in arrays])
+            beside = np.concatenate([getattr(outlines, n).reshape(-1) for n in OF_SAMPLES if n in self._outlines])
             owners = np.searchsorted(np.cumsum(sizes), beside[beside >= 0], side="right")
             named = np.bincount(owners, minlength=len(sizes)) > 0
             for samples, of_part, is_named in zip(sampled.samples, attributes, named.tolist(), strict=True):
@@ -212,10 +202,11 @@ class _Call:
                 results += [np.int32(len(samples.ids) if seen else 0), samples.ids, samples.params, *of_part[b]]
             shifts = np.arange(len(sizes)) * self._rows - np.cumsum([0, *sizes[:-1]])
             moved = np.append(np.arange(sum(sizes)) + np.repeat(shifts, sizes), -1).astype(np.int32)
+            row = sampled.row
             if len(sizes) > 1:
-                arrays |= {name: moved[arrays[name]] for name in OF_ROWS if name in arrays}
-            row = sampled.row if len(sizes) == 1 else moved[sampled.row]
-            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *arrays.values()]
+                row, outlines = moved[row], outlines.with_rows(moved.__getitem__)
+            of_outlines = [getattr(outlines, name) for name in self._outlines]
+            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *of_outlines]
             found.append(results)
         return found
 
@@ -251,12 +242,15 @@ def _specs(most: int, size: tuple[int, int], real: Any, layers: int) -> dict[str
 
 
 def _moved(rows: Array, shift: int) -> np.ndarray:
-    """Indices of rows that have moved; −1 stays."""
+    """Indices (…) int32 of rows, moved by `shift`; −1 stays."""
     return np.where(rows >= 0, rows + np.int32(shift), np.int32(-1))
 
 
 def _split(outlines: Outlines, picture: Picture) -> list[Outlines]:
-    """The outlines of each view of a picture, on the host; none lies in two views."""
+    """The outlines of each of B views of a picture, on the host: places and indices counted in the view.
+
+    No break or segment lies in two views.
+    """
     (height, width), corners = picture.view, picture.corners()[:, ::-1]
     of_break, of_segment = (
         x[:, 0] // height * picture.across + x[:, 1] // width for x in (outlines.gap, outlines.square)

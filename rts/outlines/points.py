@@ -196,7 +196,7 @@ class Points:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
         if count == 1 or stacks is None:
-            # For each break the two last samples, and the two that tell colours.
+            # For each break the two last samples, and the two that tell colours, if there are several.
             inner = np.full_like(breaks.parts, -1) if self._uniform else breaks.parts
             parts = np.concatenate([breaks.parts, inner], 1)
             points = np.concatenate([breaks.points, breaks.inner], 1)

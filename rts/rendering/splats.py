@@ -95,7 +95,7 @@ def _positions_and_colors(
         local = evaluate(part, samples, inputs)
         local_camera = world_camera.within(transform)
         add_footprint(part, samples, local, local_camera, grid.size, inputs)
-        padded = beside is not None and engine.padded(samples.row) and not has_own_rows(samples)
+        padded = beside is not None and engine.padded(samples.row) and not _has_own_rows(samples)
         used = all_in_use(samples, inputs, beside, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
         positions.append(context.constants(local_camera.project(on_rays(samples, local["position"]), grid.size)))
@@ -108,8 +108,8 @@ def _positions_and_colors(
     return positions, colors
 
 
-def has_own_rows(samples: Samples) -> bool:
-    """True if the cells of a part's samples are not those of the image, but one for each row; −1 if it is not used."""
+def _has_own_rows(samples: Samples) -> bool:
+    """True if samples have a cell (1, 1, N) for each row, −1 where it is not used, not those (K, H, W) of the image."""
     return samples.row.shape[-2:] == (1, samples.ids.shape[-2])
 
 

@@ -1,4 +1,7 @@
-"""Scenes of known values, sampled on the host whatever their engine; and their samples in arrays of that engine."""
+"""Scenes on the host: of known values, whatever their engine, or of values that a call hands over.
+
+Samples that are found there become arrays of that engine.
+"""
 
 from __future__ import annotations
 

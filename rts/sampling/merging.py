@@ -1,4 +1,4 @@
-"""The samples of several parts, merged by depth."""
+"""The samples of all parts of a scene, merged by depth."""
 
 from __future__ import annotations
 

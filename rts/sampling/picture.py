@@ -132,13 +132,9 @@ def outlines_side_by_side(
         return renumbered(ties, 0 * before[of_segment], before[of_segment])
 
     return replace(
-        whole,
+        whole.with_rows(of_samples),
         gap=whole.gap + constant(corners[of_break], whole.gap),
         square=whole.square + constant(corners[of_segment, :2], whole.square),
-        rows=of_samples(whole.rows),
-        inner=of_samples(whole.inner),
-        pair=of_samples(whole.pair),
-        stack=None if whole.stack is None else of_samples(whole.stack),
         ties=of_breaks(whole.ties),
         beyond=of_breaks(whole.beyond),
     )

@@ -49,7 +49,8 @@ class View(NamedTuple):
     def of(cls, scene: Scene, grid: Grid) -> View | None:
         """A view that can be drawn along with others; None for one that has to be drawn by itself.
 
-        Its parts must be such as can be `Joint`, of few triangles, all of one sampler. All vertices must lie in it.
+        Its parts must be such as can be `Joint`, of few triangles, alike in their tables, all of one sampler. All
+        vertices must lie in it.
         """
         sampler, cull = scene.samplers[0], scene.parts[0].cull
         for part, chosen_sampler in zip(scene.parts, scene.samplers, strict=True):

@@ -76,9 +76,7 @@ def _in_one_table(samples: Sequence[Samples]) -> Samples:
 
 def _renumbered(outlines: Outlines, moved: np.ndarray) -> Outlines:
     """Outlines of samples whose rows have `moved`."""
-    names = ("rows", "inner", "pair", "stack")
-    tables = {name: getattr(outlines, name) for name in names}
-    return replace(outlines, **{name: None if x is None else _moved(x, moved) for name, x in tables.items()})
+    return outlines.with_rows(lambda rows: _moved(rows, moved))
 
 
 def _moved(rows: Array, moved: np.ndarray) -> Array:

@@ -265,6 +265,7 @@ def test_what_no_centre_sees_is_shaded_at_its_own_samples_alone(engine):
 
     sampled = rts.sample(rts.Part(sliver, {"vertices": vertices}, Facing()), camera, SIZE)
     assert (sampled.row < 0).all() and (sampled.outlines.rows >= 0).any()
+    assert not sampled.samples[0].at_points and sampled.samples[0].ids.tolist()[0] == [1, 2, 3]
     if engine == "jax jit":
         jax = pytest.importorskip("jax")
         slope = np.asarray(jax.jit(jax.grad(loss))(jax.numpy.asarray(pose)))
@@ -273,6 +274,22 @@ def test_what_no_centre_sees_is_shaded_at_its_own_samples_alone(engine):
     else:
         slope = torch.func.vmap(torch.func.grad(loss))(torch.tensor(pose)[None])[0].numpy()
     assert np.isfinite(slope).all() and np.abs(slope).max() > 1
+
+
+def test_rows_are_counted_past_parts_that_no_centre_sees():
+    (ball, faces), hidden = (
+        icosphere(2, 0.7),
+        rts.Part(rts.Mesh([[0, 1, 2]]), {"vertices": 50 + 10 * np.eye(3)}, "lambert"),
+    )
+    vertices = np.array([[0, -1, 0], [0.01, 1, 0], [0, 1, 0]]) + [0.12326552, 0, 1]
+    camera, mesh = rts.Camera.look_at((0, 0, 3.4), (0, 0, 0), fov_y=50), rts.Mesh([[0, 1, 2]])
+    slivers = [rts.Part(mesh, {"vertices": vertices + [x, 0, 0]}, "lambert") for x in (0.0, 0.4)]
+    middle = rts.Part(rts.Mesh(faces), {"vertices": ball}, "lambert")
+    seen = [slivers[0], middle, slivers[1]]
+    whole = [hidden, slivers[0], middle, slivers[1], hidden]
+    image = rts.render(whole, camera, SIZE)
+    np.testing.assert_array_equal(image, rts.render(seen, camera, SIZE))
+    np.testing.assert_allclose(rts.render_samples(rts.sample(whole, camera, SIZE), whole, camera), image, atol=1e-6)
 
 
 def test_parts_whose_tables_differ_in_width_are_taken_one_by_one(items):

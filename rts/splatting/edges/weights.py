@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.compiling.threads import parallel, read_only
-from rts.contracts.records import Outlines
+from rts.contracts.records import OF_SEGMENTS, Outlines
 from rts.operations.operation import Arrays, Some
 
 BORDER = 1e-3
@@ -21,9 +21,6 @@ BORDER = 1e-3
 NOWHERE = np.empty((0, 2, 2))
 """In place of points, for tangents."""
 
-
-OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
-"""The fields of outlines that have a row for each segment."""
 
 OF_ROWS = tuple(field.name for field in fields(Outlines) if field.default is MISSING and field.name != "joined")
 """The fields of the outlines of one layer that have a row for each break, or for each segment."""
