@@ -121,8 +121,12 @@ class Joint:
         seen, depth = first >= 0, np.where(covered, fragments.depth, np.float32(0))
         one = Fragments(*(x.reshape(1, 1, row.size, *x.shape[3:])[:, :, first[seen]] for x in fragments))
         packed = pack_fragments(one, self.proxy)
-        ids, params = (np.zeros((len(seen), x.shape[1]), x.dtype) for x in (packed.ids, packed.params))
+        ids, params = (np.empty((len(seen), x.shape[1]), x.dtype) for x in (packed.ids, packed.params))
         ids[seen], params[seen] = packed.ids[: seen.sum()], packed.params[: seen.sum()]
+        for part in np.flatnonzero(~seen):
+            table, start = self.proxy, self.starts[part]
+            assert table.ids is not None
+            ids[part], params[part] = joint_loops.middle_of(table.ids, table.corner_params, start)
         return self._of_parts(seen, ids, params, Cells(row, depth, fragments.triangle_ids))
 
     def _of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:

@@ -7,7 +7,7 @@ import numpy as np
 from rts.compiling.loops import loop
 from rts.compiling.threads import TASKS_PER_THREAD, parallel, read_only, thread_count
 from rts.contracts.records import Fragments
-from rts.sampling.packing_loops import param_at
+from rts.sampling.packing_loops import middle_of, param_at
 
 
 def packed_by_part(
@@ -23,8 +23,8 @@ def packed_by_part(
         corner_params: (T, 3, Q) float32, or None for the barycentrics themselves.
 
     Returns:
-        The number (P,) of samples of each part; ids (N, I) and params (N, Q), with a row of zeros for each part that
-        has none; the cells' rows and depths (K, H, W), −1 and 0 where they have none.
+        The number (P,) of samples of each part; ids (N, I) and params (N, Q), with a row for each part that has none,
+        in the middle of its first triangle; the cells' rows and depths (K, H, W), −1 and 0 where they have none.
     """
     sizes, count = np.diff(starts), covered.size
     part_of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
@@ -42,7 +42,7 @@ def packed_by_part(
     ids, params = np.empty((rows.sum(), table.shape[1]), np.int32), np.empty((rows.sum(), width), np.float32)
     for empty in np.flatnonzero(counts == 0):
         first = rows[:empty].sum()
-        ids[first], params[first] = 0, 0
+        ids[first], params[first] = middle_of(table, corner_params, starts[empty])
     row, depth = np.empty(covered.shape, np.int32), np.empty(covered.shape, np.float32)
     shares, depths = (
         read_only(fragments.barycentrics, np.float32).reshape(-1, 2),

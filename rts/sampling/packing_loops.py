@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def pack(
         kept: (K, H, W) bool, the fragments to take; all of them name triangles.
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
-        capacity: rows to allot, or 0 for as many as are taken, at least one.
+        capacity: rows to allot, or 0 for as many as are taken; for none, one in the middle of the first triangle.
         views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
     lines = _Lines.of(fragments, kept, views)
@@ -43,7 +43,14 @@ def pack(
     row, depth = np.empty(lines.kept.shape, np.int32), np.empty(lines.kept.shape, np.float32)
     arrays = lines.kept, lines.triangle_ids, lines.barycentrics, lines.depths, table, corners, lines.offsets()
     parallel(_pack, len(row), *arrays, ids, params, row, depth, work=2 * row.size)
+    if not total and not capacity and len(table):
+        ids[0], params[0] = middle_of(table, corner_params, 0)
     return ids, params, row.reshape(lines.shape), depth.reshape(lines.shape), total
+
+
+def middle_of(table: np.ndarray, corner_params: np.ndarray | None, triangle: int) -> tuple[np.ndarray, Any]:
+    """Ids (I,) and params (P,) of the middle of a triangle, for a row that no cell names, but shaders see."""
+    return table[triangle], 1 / 3 if corner_params is None else corner_params[triangle].mean(axis=0)
 
 
 class _Lines(NamedTuple):

@@ -307,3 +307,21 @@ def test_parts_whose_tables_differ_in_width_are_taken_one_by_one(items):
     together = torch.func.vmap(image)(poses)
     assert items == [0]
     torch.testing.assert_close(together, torch.stack([image(p) for p in poses]), rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("shader", [Facing(), "lambert"])
+def test_the_row_of_a_part_that_is_not_seen_has_no_effect_on_the_gradient(shader):
+    # No face names the first vertex, so that its normal is zero.
+    ball, faces = icosphere(1, 0.7)
+    vertices, mesh = np.concatenate([[[0.0, 0.0, 0.0]], ball]), rts.Mesh(np.asarray(faces) + 1)
+
+    def slope_of(*places):
+        pose = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        thetas = [{"vertices": vertices + [x, 0, 0]} for x in places]
+        image = rts.render([rts.Part(mesh, theta, shader, transform=rts.rigid(pose)) for theta in thetas], CAMERA, SIZE)
+        return torch.autograd.grad(image.square().sum(), pose)[0]
+
+    slope = slope_of(0, 50)
+    assert torch.isfinite(slope).all() and (slope != 0).any()
+    with pytest.warns(rts.errors.EmptyImageWarning):
+        assert (slope_of(50) == 0).all()
