@@ -79,6 +79,11 @@ _SHARED = tuple(f.name for f in fields(Outlines) if f.name in Found._fields)
 _shared_of = attrgetter(*_SHARED)
 
 
+def samples_of_break(layers: int, uniform: bool) -> int:
+    """The largest number of samples of a break, but for a pair; `uniform` if each part has one colour."""
+    return (2 if uniform else 4) if layers == 1 else layers + 3
+
+
 def columns(layers: int) -> tuple[int, int, int]:
     """The numbers of samples of a break, of those of its stack, and of layers on each side; see `Found`."""
     return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)

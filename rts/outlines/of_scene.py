@@ -16,7 +16,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Found, columns
+from rts.outlines.found import Found, samples_of_break
 from rts.outlines.gaps import Fronts
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
@@ -73,34 +73,22 @@ def with_outlines(
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, moved, first = namespace(found.rows), [], [], 0
     for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        behind = 0 if _is_unused(of_cells) else of_cells.ids.shape[-2]
-        moved.append(first + behind)
-        whole = in_one_table([of_cells, extra]) if behind else _with_rows_of(of_cells, extra)
+        moved.append(first + of_cells.ids.shape[-2])
+        whole = in_one_table([of_cells, extra])
         if engine_of(whole.ids).padded(whole.ids):
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
     rows = found.rows
-    starts: Any = moved[0]
+    behind: Any = moved[0]
     if len(moved) > 1:
         owners = xp.reshape(xp.clip(found.parts, 0), (-1,))
-        starts = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
-        starts = xp.reshape(starts, rows.shape)
-    rows = xp.where(rows >= 0, rows + starts, rows)
+        behind = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
+        behind = xp.reshape(behind, rows.shape)
+    rows = xp.where(rows >= 0, rows + behind, rows)
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
-
-
-def _is_unused(samples: Samples) -> bool:
-    """True if a table (1, I), of NumPy, has only the row that is there so that it is not empty: no cell names it."""
-    known = type(samples.row) is np.ndarray and type(samples.ids) is np.ndarray
-    return known and samples.ids.shape[-2] == 1 and samples.row.max(initial=-1) < 0
-
-
-def _with_rows_of(samples: Samples, others: Samples) -> Samples:
-    """Samples with the rows of others in place of their own; cells and all else stay."""
-    return replace(samples, ids=others.ids, params=others.params, tables=others.tables, gbuffer=others.gbuffer)
 
 
 def most_breaks(grid: Grid, capacity: int | None) -> int:
@@ -205,10 +193,9 @@ class _Room(NamedTuple):
         capacity: int | None,
     ) -> _Room:
         """Room for the samples of at most so many breaks, in addition to `samples` of the part at centres."""
-        each, surface = columns(layers)[0], part.surface
-        if layers == 1:
-            # The two last samples, and two that tell colours. Where there is a pair, one of the first is there again.
-            each = (2 if uniform else 4) + (3 if has_pairs(part, sampler) else 0)
+        # Where there is a pair, one of the last samples is there again.
+        of_pairs, surface = 3 if layers == 1 and has_pairs(part, sampler) else 0, part.surface
+        each = samples_of_break(layers, uniform) + of_pairs
         rows, names = each * (most or 0), set(samples.tables) - set(samples.by_sample)
         if not names or not isinstance(surface, TriangleSurface):
             return cls(rows, {})

@@ -16,7 +16,7 @@ from rts.arrays.engines import Context, engine_of, is_constant, is_traced, names
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import OF_SAMPLES, OF_SEGMENTS, ArraySpec, Cells, Outlines, Request, Sampled, Samples
-from rts.outlines.found import Found
+from rts.outlines.found import Found, samples_of_break
 from rts.outlines.of_scene import most_breaks, with_outlines
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
@@ -69,7 +69,7 @@ class _Call:
         self._most = most_breaks(grid, request.capacity) if traced else None
         self._context, kept = Context(engine_of(), np.zeros((), real_of(scene))), 1 if all(scene.opaque) else layers
         cells = 1 if request.uniform else layers * grid.size[0] * grid.size[1]
-        beside = 0 if self._most is None else self._most * ((2 if uniform else 4) if layers == 1 else layers + 3)
+        beside = (self._most or 0) * samples_of_break(layers, uniform)
         rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
         # Without fixed shapes there is no bound.
         self._rows = rows if traced else (2**31 - 1) // len(scene.parts)

@@ -38,7 +38,7 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
 
 
 def values_of(scene: Scene, grid: Grid) -> Tree:
-    """What samples of triangles depend on: the camera of the cells; camera, transform and inputs of each part."""
+    """All that samples of triangles depend on: the camera of the cells; camera, transform and inputs of each part."""
     of_parts = [
         # The product that later projects the samples, to the bit.
         (scene.local_camera(index, grid), part.transform, proxy_inputs(part) if entry is None else None)
