@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
-
-import numpy as np
 
 TORCH_SPINS = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
 """Whether torch was imported before rts: its idle OpenMP threads then spin, on cores that loops could use."""
@@ -16,7 +15,22 @@ if "OMP_WAIT_POLICY" not in os.environ:
     # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-# Freed memory then serves the next step, whose pages the system would clear anew. glibc learns from the largest block
-# below 32 MB that is freed: smaller ones come from the heap, whose end goes back once twice as much of it is free.
-# `MALLOC_TRIM_THRESHOLD_` of the environment turns this off.
-np.empty(31 << 20, np.uint8)
+KEPT, HEAP = 128 << 20, 31 << 20
+"""Bytes at the heap's end that stay when they are free; smaller blocks than the second number come from the heap."""
+
+
+def _keep_freed_memory() -> None:
+    """Have freed memory serve the next step, whose pages the system would clear anew; glibc alone.
+
+    `MALLOC_TRIM_THRESHOLD_` of the environment turns this off.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None and "MALLOC_TRIM_THRESHOLD_" not in os.environ:
+        mallopt(M_TRIM_THRESHOLD, KEPT)
+        mallopt(M_MMAP_THRESHOLD, HEAP)
+
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""The parameters' numbers in malloc.h."""
+
+_keep_freed_memory()

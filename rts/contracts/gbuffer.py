@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rts.errors import InputError
+from rts.operations.unit import unit
 
 
 class GBuffer(dict):
@@ -23,6 +24,7 @@ class GBuffer(dict):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self._deferred: dict[str, Callable[[], Any]] = {}
+        self._units: dict[str, tuple[Any, Any]] = {}
         self._like = None
 
     @property
@@ -42,6 +44,13 @@ class GBuffer(dict):
     def defer(self, name: str, compute: Callable[[], Any]) -> None:
         """Add an attribute that is computed by `compute()` when first read."""
         self._deferred[name] = compute
+
+    def unit(self, name: str) -> Any:
+        """An attribute of vectors (N, 3), scaled to length one; a zero vector stays zero. Computed once."""
+        vectors = self[name]
+        if name not in self._units or self._units[name][0] is not vectors:
+            self._units[name] = vectors, unit(vectors)
+        return self._units[name][1]
 
     def __missing__(self, name: str) -> Any:
         if name not in self._deferred:

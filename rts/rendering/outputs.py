@@ -17,7 +17,6 @@ from rts.contracts.records import Sampled, Splats
 from rts.contracts.shader import Shader
 from rts.errors import InputError
 from rts.operations.means import Channels, channels_of
-from rts.operations.unit import unit
 from rts.plugin_base import promised
 from rts.rendering.settings import RenderSettings
 from rts.sampling.scene import Scene
@@ -80,7 +79,7 @@ class Outputs:
                 arrays.append(namespace(gbuffer.like).zeros_like(gbuffer["position"][:, :2]))
                 continue
             elif name in gbuffer:
-                array = unit(gbuffer[name]) if name == "normal" else gbuffer[name]
+                array = gbuffer.unit(name) if name == "normal" else gbuffer[name]
             else:
                 raise InputError(_unknown(name, gbuffer))
             self._widths[name].add(shape_of(array)[1])

@@ -105,7 +105,7 @@ class Pbr(Unlit):
         """Unit normals (N, 3), bent by the normal map; frames seen from behind are turned over, as glTF says."""
         bent = self._entry(theta, gbuffer, "normal_map", 3)
         if bent is None:
-            normal = unit(gbuffer["normal"])
+            normal = gbuffer.unit("normal")
         else:
             tangent, bitangent, upright = tangent_frame(gbuffer)
             normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * upright)

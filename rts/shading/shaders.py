@@ -63,7 +63,7 @@ class Normals(Shader):
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
-        return _opaque(unit(gbuffer["normal"]) * 0.5 + 0.5)
+        return _opaque(gbuffer.unit("normal") * 0.5 + 0.5)
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class Lambert(Unlit):
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
-        normal, behind = unit(gbuffer["normal"]), is_behind(gbuffer, camera)
+        normal, behind = gbuffer.unit("normal"), is_behind(gbuffer, camera)
         xp = namespace(color)
         light = light_of(theta, camera)
         shade = light.diffuse(xp.where(behind, -normal, normal)) if light.directed else light.diffuse(normal)
@@ -226,7 +226,7 @@ class BlinnPhong(Unlit):
 
 def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array, Array]:
     """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
-    normal, toward = unit(gbuffer["normal"]), unit(camera.toward(gbuffer["position"]))
+    normal, toward = gbuffer.unit("normal"), unit(camera.toward(gbuffer["position"]))
     return namespace(normal).where(dot(normal, toward) < 0, -normal, normal), toward
 
 

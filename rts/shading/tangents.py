@@ -81,6 +81,6 @@ def tangent_frame(gbuffer: GBuffer) -> tuple[Array, Array, Array]:
     Args:
         gbuffer: "normal" (N, 3) and "tangent" (N, 4), as shaders receive them; not turned to the viewer.
     """
-    normal, frame = unit(gbuffer["normal"]), gbuffer[TANGENT]
+    normal, frame = gbuffer.unit("normal"), gbuffer[TANGENT]
     tangent = unit(frame[:, :3] - dot(normal, frame[:, :3]) * normal)
     return tangent, frame[:, 3:] * namespace(normal).linalg.cross(normal, tangent), normal
