@@ -183,7 +183,6 @@ def _patched(way):
             patch.setattr(threads, "LITTLE_WORK", 1)
         if "specified" in way:
             patch.setattr(edges, "EDGES", edges._specification)
-            patch.setattr(edges, "CELLS", edges_stacks._specification)
             patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
         yield
 

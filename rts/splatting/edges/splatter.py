@@ -34,7 +34,7 @@ from rts.operations.operation import Operation
 from rts.plugin_base import overrides
 from rts.splatting.cells import centres, check_rows, nothing, unpack
 from rts.splatting.edges import weights as edges_weights
-from rts.splatting.edges.stacks import CELLS, Operands
+from rts.splatting.edges.stacks import Operands, in_cells
 from rts.splatting.edges.weights import BORDER
 
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
@@ -130,9 +130,8 @@ class Edges(SummingSplatter):
 def _without_outlines(splats: Splats) -> Array:
     """The image (H, W, C) as if all cells showed one surface, or stacks of the same layers."""
     row = splats.row[:1, ...] if splats.opaque else splats.row
-    cells = CELLS(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
-    colors, motion = cells[..., : splats.rgba.shape[1]], cells[..., splats.rgba.shape[1] :]
-    return colors + (motion - stopped(motion))
+    colors, motion = in_cells(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
+    return colors + motion
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array, border: int) -> Array:

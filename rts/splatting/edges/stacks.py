@@ -86,8 +86,7 @@ class Operands(NamedTuple):
         """The operands for splats of K layers."""
         positions, rgba, row = splats.positions, splats.rgba, splats.row
         xp, (height, width), breaks = namespace(rgba), row.shape[1:], outlines.place.shape[0]
-        cells, sides = CELLS(positions, rgba, row, outlines.joined), _Sides.of(splats, outlines)
-        whole, motion = cells[..., : rgba.shape[1]], cells[..., rgba.shape[1] :]
+        (whole, motion), sides = in_cells(positions, rgba, row, outlines.joined), _Sides.of(splats, outlines)
         numbers = [_numbered(sides.front[i * breaks : (i + 1) * breaks], (height * width) + i * breaks) for i in (0, 1)]
         rows = xp.stack(numbers, axis=-1)
         at = xp.reshape(centres(height, width, rgba), (-1, 2))
@@ -102,8 +101,17 @@ class Operands(NamedTuple):
         )
 
 
+def in_cells(positions: Array, rgba: Array, row: Array, joined: Array) -> tuple[Array, Array]:
+    """Composites (H, W, C) of cells, and −Σ D_k · m_k (H, W, C): no value, but the derivative of motions."""
+    shape = *row.shape[1:], rgba.shape[1]
+    # Cut, since the derivative of a slice is an array as large as both.
+    whole, motion = engine_of(rgba).split(CELLS(positions, rgba, row, joined), [1, 1])
+    reshape = namespace(rgba).reshape
+    return reshape(whole, shape), reshape(motion, shape)
+
+
 def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> Array:
-    """Composites (H, W, C) of cells, and then −Σ D_k · m_k (H, W, C), without value; (H, W, 2 C).
+    """See `in_cells`; both in one array (2, H, W, C).
 
     Slopes are means of the differences from and to the next cells of the same layers.
     """
@@ -116,17 +124,18 @@ def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> 
         slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
         change = through * (slope - slope[..., -1:] * behind)
         total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
-    return xp.concat([cells.whole, total], axis=-1)
+    return xp.stack([cells.whole, total - stopped(total)])
 
 
 def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
-    return *row[1:], 2 * rgba[1]
+    return 2, *row[1:], rgba[1]
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     from rts.splatting.edges import stacks_loops as loops
 
-    parallel(loops.cells, len(out), *operands, out, work=10 * out.size)
+    _, rgba, row, _ = operands
+    parallel(loops.cells, row.shape[1], rgba, row, out, work=2 * row.size)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
@@ -135,7 +144,8 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     positions, rgba, row, joined = operands
     none = read_only(np.empty((0, 3), out.dtype))
     t_positions, t_rgba = (none if t is None else read_only(t) for t in tangents)
-    parallel(loops.push_cells, len(out), rgba, row, joined, t_positions, t_rgba, out, work=10 * out.size)
+    arrays = rgba, row, joined, t_positions, t_rgba, out
+    parallel(loops.push_cells, row.shape[1], *arrays, work=10 * row.size)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
@@ -147,7 +157,7 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 
 CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _forward, _push, _pull, differentiable=2)
-"""(H, W, 2 C) of positions (N, 3), colours (N, C), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
+"""(2, H, W, C) of positions (N, 3), colours (N, C), `row` (K, H, W) and `Outlines.joined`: see `in_cells`."""
 
 
 def _numbered(row: Array, first: int) -> Array:
