@@ -20,6 +20,7 @@ import rts
 from rts.arrays.trees import leaves, map_leaves
 from rts.compiling import threads
 from rts.splatting.edges import splatter as edges
+from rts.splatting.edges import stack_sides
 from rts.splatting.edges import stacks as edges_stacks
 
 FLAGS = ("threads", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
@@ -184,6 +185,7 @@ def _patched(way):
         if "specified" in way:
             patch.setattr(edges, "EDGES", edges._specification)
             patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
+            patch.setattr(stack_sides, "SIDES", stack_sides._specification)
         yield
 
 

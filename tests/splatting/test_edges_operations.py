@@ -6,8 +6,9 @@ from cards import SIZE, SQUARE, in_pixels, turned, two_colors
 from helpers import box, icosphere
 
 import rts
-from rts.splatting.edges import splatter, stacks
+from rts.splatting.edges import splatter, stack_sides, stacks
 from rts.splatting.edges.splatter import EDGES, FIELDS
+from rts.splatting.edges.stack_sides import SIDES
 from rts.splatting.edges.stacks import CELLS
 from rts.testing import OperationConformance
 
@@ -61,19 +62,26 @@ KNOWN = {}
 
 
 def operands_of(name, operation):
-    """What an operation, "EDGES" or "CELLS", is given where a scene is drawn."""
-    if name not in KNOWN:
+    """What an operation, "EDGES", "CELLS" or "SIDES", is given where a scene is drawn."""
+    if (name, operation) not in KNOWN:
         make, camera, size = SCENES[name]
-        known = KNOWN[name] = {}
+        known = KNOWN[name, operation] = {}
+
+        def noted(own, called):
+            def call(*operands, **params):
+                known.setdefault(own, operands)
+                return called(*operands, **params)
+
+            return call
+
         with pytest.MonkeyPatch.context() as patch:
-            for module, own, called in ((splatter, "EDGES", EDGES), (stacks, "CELLS", CELLS)):
-                patch.setattr(
-                    module,
-                    own,
-                    lambda *x, own=own, called=called, **params: called(*known.setdefault(own, x), **params),
-                )
-            rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1)
-    return list(KNOWN[name][operation])
+            modules = {splatter: ("EDGES", EDGES), stacks: ("CELLS", CELLS), stack_sides: ("SIDES", SIDES)}
+            for module, (own, called) in modules.items():
+                patch.setattr(module, own, noted(own, called))
+            # NumPy has no derivatives, so that it does without SIDES.
+            engine = "torch" if operation == "SIDES" else None
+            rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1, engine=engine)
+    return [np.asarray(x) for x in KNOWN[name, operation][operation]]
 
 
 def unseen():
@@ -116,3 +124,13 @@ class TestCells(OperationConformance):
     @pytest.fixture
     def operands(self):
         return operands_of("panes", "CELLS")
+
+
+class TestSides(OperationConformance):
+    @pytest.fixture
+    def operation(self):
+        return SIDES
+
+    @pytest.fixture
+    def operands(self):
+        return operands_of("panes", "SIDES")

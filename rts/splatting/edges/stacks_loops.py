@@ -144,3 +144,134 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
                     along += _change(rgba, behind, k, through[k], up, down, c) * g[1, y, x, c]
                 g_positions[n, 0] -= across
                 g_positions[n, 1] -= along
+
+
+# ---------------------------------------------------------------------------------------------------- beside breaks
+
+
+@compiled
+def _fill_normals(gap, place, ties, normal):
+    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    for b in range(len(gap)):
+        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
+    for s in range(len(ties)):
+        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
+            continue
+        start, end = ties[s, 0], ties[s, 1]
+        nx = gap[end, 0] - gap[start, 0] + place[end] * (1 - gap[end, 2]) - place[start] * (1 - gap[start, 2])
+        ny = gap[start, 1] - gap[end, 1] + place[start] * gap[start, 2] - place[end] * gap[end, 2]
+        for b in (start, end):
+            # Two segments at a line of crossing may run in opposite directions.
+            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
+            normal[b, 0] += sign * nx
+            normal[b, 1] += sign * ny
+    for b in range(len(gap)):
+        length = np.hypot(normal[b, 0], normal[b, 1])
+        normal[b, 0] /= length
+        normal[b, 1] /= length
+
+
+@compiled
+def _color(rgba, n, c):
+    """A channel of a sample; 0 for none."""
+    return rgba[n, c] if n >= 0 else 0.0
+
+
+@compiled
+def _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers):
+    """Fill in how the composite beside a break changes, where samples move.
+
+    It changes by `change` (K + 1, C) times the motion, along `moves` (K + 1, 2), of both `movers` (K + 1, 2), samples
+    or −1. The last row is of the sample that ends there, as if the composite moved with it.
+    """
+    layers, count = len(row), rgba.shape[1]
+    y, x = cell
+    along_x, along_y = (gap[b, 2], 1 - gap[b, 2]) if i == 1 else (-gap[b, 2], gap[b, 2] - 1)
+    across = normal[b, 0] * along_x + normal[b, 1] * along_y
+    alpha, light = count - 1, 1.0
+    for k in range(layers):
+        through[k] = light
+        light *= 1 - _color(rgba, row[k, y, x], alpha)
+    for c in range(count):
+        back, other = 0.0, 0.0
+        for k in range(layers - 1, -1, -1):
+            n, m = row[k, y, x], stack[b, i, k]
+            behind[k, c] = back
+            back = _color(rgba, n, c) + (1 - _color(rgba, n, alpha)) * back
+            other = _color(rgba, m, c) + (1 - _color(rgba, m, alpha)) * other
+        change[layers, c] = back - other if rows[b, i] >= 0 else 0.0
+    movers[layers, 0], movers[layers, 1] = rows[b, i], -1
+    moves[layers, 0], moves[layers, 1] = 0.5 * across * normal[b, 0], 0.5 * across * normal[b, 1]
+    for k in range(layers):
+        n, m, ends = row[k, y, x], stack[b, i, k], True
+        for other_layer in range(layers):
+            ends &= stack[b, 1 - i, other_layer] != m
+        movers[k, 0], movers[k, 1] = n, m
+        moves[k, 0], moves[k, 1] = 0.5 * along_x, 0.5 * along_y
+        if ends:
+            moves[k, 0], moves[k, 1] = moves[layers, 0], moves[layers, 1]
+        opacity = _color(rgba, m, alpha) - _color(rgba, n, alpha)
+        for c in range(count):
+            rise = _color(rgba, m, c) - _color(rgba, n, c)
+            change[k, c] = through[k] * (rise - opacity * behind[k, c])
+
+
+@compiled
+def _cells_of(gap, place, b, i):
+    """The cell on a side of a break and the one beyond, (y, x) each, and the share of a change that the first has."""
+    y, x, right = gap[b, 0], gap[b, 1], gap[b, 2]
+    first, second = (y, x), (y + 1 - right, x + right)
+    length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
+    share = min(length, 0.5) / (length if length > 1e-6 else 1.0)
+    return (first, second, share) if i == 0 else (second, first, share)
+
+
+@compiled
+def _room(row, rgba):
+    """Room for `_weigh_side`."""
+    layers, count = len(row), rgba.shape[1]
+    changes = np.empty((layers + 1, count)), np.empty((layers + 1, 2)), np.empty((layers + 1, 2), np.int32)
+    return np.empty(layers), np.empty((layers, count)), *changes
+
+
+@loop
+def push_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_points, t_positions, out):
+    """Add to `out` (H, W, C) how composites change beside breaks as samples move, see `stack_sides`."""
+    normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
+    _fill_normals(gap, place, ties, normal)
+    for b in range(len(gap)):
+        for i in range(2):
+            if not (ends[b, i] and stack[b, i, 0] >= 0):
+                continue
+            cell, beyond, share = _cells_of(gap, place, b, i)
+            _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
+            for k in range(len(row) + 1):
+                motion = 0.0
+                for n in movers[k]:
+                    if n >= 0:
+                        motion += moves[k, 0] * t_positions[n, 0] + moves[k, 1] * t_positions[n, 1]
+                for c in range(rgba.shape[1]):
+                    out[cell[0], cell[1], c] += share * change[k, c] * motion
+                    out[beyond[0], beyond[1], c] += (1 - share) * change[k, c] * motion
+
+
+@loop
+def pull_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_points, g, g_positions):
+    """Add to gradients of positions those of `push_sides`."""
+    normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
+    _fill_normals(gap, place, ties, normal)
+    for b in range(len(gap)):
+        for i in range(2):
+            if not (ends[b, i] and stack[b, i, 0] >= 0):
+                continue
+            cell, beyond, share = _cells_of(gap, place, b, i)
+            _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
+            for k in range(len(row) + 1):
+                total = 0.0
+                for c in range(rgba.shape[1]):
+                    mixed = share * g[cell[0], cell[1], c] + (1 - share) * g[beyond[0], beyond[1], c]
+                    total += change[k, c] * mixed
+                for n in movers[k]:
+                    if n >= 0:
+                        g_positions[n, 0] += moves[k, 0] * total
+                        g_positions[n, 1] += moves[k, 1] * total
