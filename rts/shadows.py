@@ -18,7 +18,6 @@ from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checked_parts import check_parts, listed_parts
 from rts.contracts.checks import check_size
 from rts.errors import InputError
-from rts.operations.take import take
 from rts.operations.unit import unit
 from rts.rendering.arguments import Layers, SamplerLike
 from rts.rendering.samples import sample
@@ -91,20 +90,18 @@ def _picture(
     opaque, context = all(scene.opaque), scene.context
     if opaque and sampled.depth is not None and not context.engine.differentiates:
         depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
-        return picture_of(depth, None, None, row, place, size)
+        # Nothing moves.
+        samples, row = np.zeros((1, 3), depth.dtype), np.minimum(row, 0)
+        return picture_of(depth, samples, row, place, size, opaque)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
-    place = constants(scene.camera, engine_of(splats.positions), splats.positions)
-    positions = _in_cells(splats.positions, splats.row)
-    alpha = None if opaque else _in_cells(splats.rgba[:, -1:], splats.row)
-    return picture_of(stopped(positions[..., 2]), positions[..., :2], alpha, splats.row, place, size)
-
-
-def _in_cells(values: Array, row: Array) -> Array:
-    """Values (M, C) of samples as (K, H, W, C); of some sample, or zero, where a cell has none."""
-    if not values.shape[0]:
-        values = constants(np.zeros((1, values.shape[1])), engine_of(values), values)
-    xp = namespace(values)
-    return xp.reshape(take(values, xp.reshape(xp.clip(row, 0, None), (-1,))), (*row.shape, values.shape[1]))
+    positions, row, engine = splats.positions, splats.row, engine_of(splats.positions)
+    place = constants(scene.camera, engine, positions)
+    if not positions.shape[0]:
+        positions = constants(np.zeros((1, 3)), engine, positions)
+    xp = namespace(positions)
+    depth = xp.reshape(xp.take(stopped(positions)[:, 2], xp.reshape(xp.clip(row, 0, None), (-1,))), tuple(row.shape))
+    samples = positions if opaque else xp.concat([positions[:, :2], splats.rgba[:, -1:]], axis=1)
+    return picture_of(depth, samples, row, place, size, opaque)
 
 
 def _without_shadow(part: Part) -> Part:

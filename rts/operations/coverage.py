@@ -17,8 +17,8 @@ from rts.operations.depth_limits import BIAS, FAR, OWN, REACH
 from rts.operations.operation import Operation
 
 
-def coverage(cells: Array, points: Array, planes: Array, lens: Array) -> Array:
-    """The covered share of points (N, 1), 0 to 1, differentiable in cells and points, to first order.
+def coverage(samples: Array, points: Array, row: Array, planes: Array, lens: Array, opaque: bool = True) -> Array:
+    """The covered share of points (N, 1), 0 to 1, differentiable in samples and points, to first order.
 
     Points beside the picture or before the near plane are not covered.
 
@@ -27,14 +27,15 @@ def coverage(cells: Array, points: Array, planes: Array, lens: Array) -> Array:
     the slope of a surface across a single cell is not known.
 
     Args:
-        cells: (H · W, 2) x and y of the sample in each cell, of which only derivatives count; with alpha, if the
-            samples are not opaque, (H · W, 3).
+        samples: (M, 3) x and y of samples, of which only derivatives count; then alpha, or anything if they are opaque.
         points: (N, 3) x and y from the picture's upper left corner, and linear depth, which has no derivative.
-        planes: (H, W, 8) of the sample in each cell, see `depth_planes`; the picture is `REACH` cells smaller on every
+        row: (H, W) the sample in each cell, or −1.
+        planes: (9, H, W) of the sample in each cell, see `depth_planes`; the picture is `REACH` cells smaller on every
             side. Depths in it are `even_depth`.
         lens: (4,): a and b, of clip w a + b · depth; the depth that even depths count from; that of the near plane.
+        opaque: whether samples let no light through.
     """
-    return COVERAGE(cells, points, planes, lens)
+    return COVERAGE(samples, points, row, planes, lens, opaque=opaque)
 
 
 def is_inside(points: Array, size: tuple[int, int], lens: Array) -> Array:
@@ -62,9 +63,9 @@ def quadratic(d: Array) -> Array:
     return xp.where(d < 0.5, 0.75 - d * d, tail * tail / 2)
 
 
-def _specification(cells: Array, points: Array, planes: Array, lens: Array) -> Array:
-    xp, at, translucent = namespace(cells), stopped(points), cells.shape[1] > 2
-    height, width = planes.shape[:2]
+def _specification(samples: Array, points: Array, row: Array, planes: Array, lens: Array, *, opaque: bool) -> Array:
+    xp, at = namespace(samples), stopped(points)
+    height, width = planes.shape[1:]
     inside = is_inside(at, (height - 2 * REACH, width - 2 * REACH), lens)
     x, y = (REACH + xp.where(inside, at[:, i], 0.0) for i in range(2))
     # Beside the picture, nothing lies in front.
@@ -72,12 +73,11 @@ def _specification(cells: Array, points: Array, planes: Array, lens: Array) -> A
     corner = [xp.floor(xp.clip(c - 1.5, 0, n - 4)) for c, n in ((x, width), (y, height))]
     dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
     first = xp.astype(corner[1], xp.int32) * width + xp.astype(corner[0], xp.int32)
-    flat, alphas = xp.reshape(planes, (-1, 8)), stopped(cells)[:, 2] if translucent else None
+    flat, row = xp.reshape(planes, (9, -1)), xp.reshape(xp.clip(row, 0, None), (-1,))
     around, closest, surface = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
     for j, i in itertools.product(range(4), range(4)):
         index = first + (j * width + i)
-        plane = xp.take(flat, index, axis=0)
-        z, unit, a, b = (plane[:, k] for k in range(4))
+        z, unit, a, b = (xp.take(flat[k, ...], index) for k in range(4))
         there, steep = unit > 0, unit + abs(a) + abs(b)
         seen = xp.where(there, z + a * dx[i] + b * dy[j], FAR)
         around[j, i] = index, z, seen, there & (seen < depth - BIAS * steep)
@@ -89,13 +89,13 @@ def _specification(cells: Array, points: Array, planes: Array, lens: Array) -> A
         rise_x, rise_y, steep = surface
         front = front & ((closest >= OWN) | (z < depth - rise_x * dx[i] - rise_y * dy[j] - BIAS * steep))
         weights[j, i] = xp.where(front, cubic(dx[i]) * cubic(dy[j]), 0.0)
-        alpha = xp.ones_like(x) if alphas is None else xp.take(alphas, index)
+        alpha = xp.ones_like(x) if opaque else xp.take(stopped(samples)[:, 2], xp.take(row, index))
         covers[j, i] = xp.where(front, alpha, 0.0)
     covered = sum(weights[cell] * covers[cell] for cell in covers)
     change = xp.zeros_like(covered)[:, None]
-    if translucent:
-        alphas = cells[:, 2:] - stopped(cells[:, 2:])
-        change = combine(alphas, *_stacked([index for index, *_ in around.values()], [*weights.values()]))
+    if not opaque:
+        alphas, ids = samples[:, 2:] - stopped(samples[:, 2:]), [xp.take(row, index) for index, *_ in around.values()]
+        change = combine(alphas, *_stacked(ids, [*weights.values()]))
     for axis, (across, along) in enumerate(((dx, dy), (dy, dx))):
         ids, flows = [], []
         for i, j in itertools.product(range(3), range(4)):
@@ -105,12 +105,12 @@ def _specification(cells: Array, points: Array, planes: Array, lens: Array) -> A
             flow = (covers[before] - covers[behind]) * quadratic(across[i] - 0.5) * cubic(along[j])
             # The side at the end of the cell before, or at the start of the cell behind; motions from within.
             side = 2 * axis + 4 + xp.astype(nearer, cell.dtype)
-            beyond = flow * xp.take(xp.reshape(planes, (-1,)), 8 * cell + side)
+            beyond = flow * xp.take(xp.reshape(planes, (-1,)), side * height * width + cell)
             within = cell + xp.where(nearer, -1, 1) * (1, width)[axis]
-            ids += [cell, xp.clip(within, 0, height * width - 1)]
+            ids += [xp.take(row, cell), xp.take(row, xp.clip(within, 0, height * width - 1))]
             flows += [flow + beyond, -beyond]
         moved = (points - at)[:, axis : axis + 1] * xp.sum(xp.stack(flows, axis=1), axis=1, keepdims=True)
-        motions = cells[:, axis : axis + 1] - stopped(cells[:, axis : axis + 1])
+        motions = samples[:, axis : axis + 1] - stopped(samples[:, axis : axis + 1])
         change = change - moved + combine(motions, *_stacked(ids, flows))
     return xp.clip(covered, 0.0, 1.0)[:, None] + change
 
@@ -121,7 +121,7 @@ def _stacked(ids: list[Array], weights: list[Array]) -> tuple[Array, Array]:
     return xp.stack(ids, axis=1), xp.stack(weights, axis=1)
 
 
-def _shape(cells: tuple[int, ...], points: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, int]:
+def _shape(samples: tuple[int, ...], points: tuple[int, ...], *_: tuple[int, ...], opaque: bool) -> tuple[int, int]:
     return points[0], 1
 
 
@@ -134,7 +134,7 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 COVERAGE = Operation.of_loops(
     "rts.coverage",
     _specification,
-    (2, 2, 3, 1),
+    (2, 2, 2, 3, 1),
     _shape,
     _loops,
     differentiable=2,
@@ -142,4 +142,4 @@ COVERAGE = Operation.of_loops(
     packed_result=True,
     keeps=True,
 )
-"""The operation of `coverage`."""
+"""The operation of `coverage`; `opaque` is a parameter."""

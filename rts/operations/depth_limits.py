@@ -2,6 +2,8 @@
 
 BIAS = 0.1
 """How far in front of a point a cell must be, in changes of depth over a cell."""
+NEARER = 0.99 * BIAS
+"""A little less than `BIAS`, by which planes that may be in front of a point are told from others."""
 OWN = 0.5
 """How far a point may be from the plane of a cell, in changes of depth over a cell, to lie on the same surface."""
 FAR = 1e30

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rts.arrays.engines import namespace
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.operations.depth_limits import FLAT, RIM
+from rts.operations.depth_limits import FAR, FLAT, NEARER, RIM
 from rts.operations.operation import Operation
 
 
 def depth_planes(even: Array, unit: Array) -> Array:
-    """The surface in each cell, (H, W, 8): `even`, `unit`, its slopes along x and y, and how far its sides lie away.
+    """The surface in each cell, (9, H, W): `even`, `unit`, slopes along x and y, how far four sides lie away, a limit.
 
-    The last four are of the left, right, upper and lower side, in cells from the centre; by them motions are
-    extrapolated from within. On a smooth rim motions change with the root of the distance from the outline, as depths
-    do. The result has no derivative.
+    Sides are the left, right, upper and lower one, in cells from the centre; by them motions are extrapolated from
+    within. On a smooth rim motions change with the root of the distance from the outline, as depths
+    do. Where a point's even depth is at most the limit, plus the slopes times the point's x and y, the surface's plane
+    is not in front of it. The result has no derivative.
 
     Args:
         even: (H, W) depth, of a kind that grows evenly on planes.
@@ -30,7 +31,15 @@ def _specification(even: Array, unit: Array) -> Array:
         rise = _Rise(even, unit, axis)
         slopes.append(rise.slope())
         sides += [rise.beyond(-1), rise.beyond(1)]
-    return namespace(even).stack([even, unit, *slopes, *sides], axis=-1)
+    xp, (a, b), (x, y) = namespace(even), slopes, _centres(even)
+    limit = even + NEARER * (unit + abs(a) + abs(b)) - a * x - b * y
+    return xp.stack([even, unit, a, b, *sides, xp.where(unit > 0, limit, FAR)])
+
+
+def _centres(even: Array) -> tuple[Array, Array]:
+    """The x (1, W) and y (H, 1) of the centres of cells."""
+    engine, (height, width) = engine_of(even), even.shape
+    return engine.arange(width, even)[None, :] + 0.5, engine.arange(height, even)[:, None] + 0.5
 
 
 class _Rise:
@@ -69,7 +78,7 @@ class _Rise:
 
 
 def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, ...]:
-    return *even, 8
+    return 9, *even
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:

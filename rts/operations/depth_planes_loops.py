@@ -6,14 +6,14 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
-from rts.operations.depth_limits import FLAT, RIM
+from rts.operations.depth_limits import FAR, FLAT, NEARER, RIM
 
 WORK = 30
 """Nanoseconds for a cell, roughly."""
 
 
 def forward(even: np.ndarray, unit: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (H, W, 8)."""
+    """Fill `out` (9, H, W)."""
     parallel(_forward, len(even), even, unit, out, work=WORK * even.size)
 
 
@@ -57,7 +57,7 @@ def _forward(start, stop, even, unit, out):
     for y in range(start, stop):
         for x in range(width):
             z, u = even[y, x], unit[y, x]
-            out[y, x, 0], out[y, x, 1] = z, u
+            out[0, y, x], out[1, y, x] = z, u
             for axis in range(2):
                 # The cells from two behind to two ahead.
                 if axis == 0:
@@ -71,6 +71,9 @@ def _forward(start, stop, even, unit, out):
                     is_far_back, is_back = unit[i, x] > 0, unit[j, x] > 0
                     is_ahead, is_far_ahead = unit[k, x] > 0, unit[m, x] > 0
                 is_back, is_ahead = is_back and u > 0, is_ahead and u > 0
-                out[y, x, 2 + axis] = _slope(ahead - z, is_ahead, z - back, is_back, u)
-                out[y, x, 4 + 2 * axis] = _beyond(z - ahead, ahead - far_ahead, is_ahead and is_far_ahead, u)
-                out[y, x, 5 + 2 * axis] = _beyond(z - back, back - far_back, is_back and is_far_back, u)
+                out[2 + axis, y, x] = _slope(ahead - z, is_ahead, z - back, is_back, u)
+                out[4 + 2 * axis, y, x] = _beyond(z - ahead, ahead - far_ahead, is_ahead and is_far_ahead, u)
+                out[5 + 2 * axis, y, x] = _beyond(z - back, back - far_back, is_back and is_far_back, u)
+            a, b = float(out[2, y, x]), float(out[3, y, x])
+            limit = z + NEARER * (u + abs(a) + abs(b)) - a * (x + 0.5) - b * (y + 0.5)
+            out[8, y, x] = limit if u > 0 else FAR

@@ -5,6 +5,8 @@ Pictures are of samples without derivative, evaluated with derivatives: see `rts
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,23 +21,27 @@ from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
 
 
-@record(static=("size",))
+@record(static=("size", "opaque"))
 class Picture:
     """The samples that a camera sees in front, and their planes; with `REACH` cells around the picture.
 
     Attributes:
         camera: the camera. Differentiable.
-        cells: (K, H · W, 2 or 3), see `rts.operations.coverage`, of K layers. Differentiable.
-        planes: (K, H, W, 8), likewise.
-        lens: (4,), see `rts.operations.coverage`.
+        samples: (M, 3), see `rts.operations.coverage`. Differentiable.
+        row: (K, H, W), likewise, of K layers.
+        planes: (K, 9, H, W), likewise.
+        lens: (4,), likewise.
         size: (height, width) of the picture.
+        opaque: whether the samples let no light through.
     """
 
     camera: Camera
-    cells: Array
+    samples: Array
+    row: Array
     planes: Array
     lens: Array
     size: tuple[int, int]
+    opaque: bool
 
 
 @record()
@@ -75,14 +81,15 @@ def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
     context = context_of(seen, points)
     seen, points = context.constants((seen, points))
     xp = namespace(points)
-    share, inside = xp.ones_like(points[:, 0]), xp.zeros_like(points[:, 0], dtype=xp.bool)
+    shares, inside = [], xp.zeros_like(points[:, 0], dtype=xp.bool)
     for picture in seen.pictures:
-        placed = xp.astype(picture.camera.project(points, picture.size), picture.cells.dtype, copy=False)
-        for layer in range(picture.cells.shape[0]):
-            hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...], picture.lens)
-            share = share * (1 - hidden[:, 0])
+        placed = xp.astype(picture.camera.project(points, picture.size), picture.samples.dtype, copy=False)
+        for layer in range(picture.row.shape[0]):
+            layers = picture.row[layer, ...], picture.planes[layer, ...]
+            shares.append(1 - coverage(picture.samples, placed, *layers, picture.lens, picture.opaque))
         if outside != 1:
             inside = inside | is_inside(stopped(placed), picture.size, picture.lens)
+    share = functools.reduce(operator.mul, shares)[:, 0] if shares else xp.ones_like(points[:, 0])
     return share if outside == 1 else xp.where(inside, share, outside)
 
 
@@ -91,22 +98,22 @@ def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
     if seen is None:
         return 1.0
     records = [seen] if isinstance(seen, Seen) else seen
-    total: Any = sum(visibility(one, points, outside=1.0) for one in records)
-    return total[:, None] / len(records)
+    several = [visibility(one, points, outside=1.0)[:, None] for one in records]
+    return several[0] if len(several) == 1 else functools.reduce(operator.add, several) / len(several)
 
 
 def picture_of(
-    depth: Array, moving: Array | None, alpha: Array | None, row: Array, camera: Camera, size: tuple[int, int]
+    depth: Array, samples: Array, row: Array, camera: Camera, size: tuple[int, int], opaque: bool
 ) -> Picture:
     """The picture of samples in their cells.
 
     Args:
         depth: (K, H, W) linear depth, without derivative; anything where a cell has no sample.
-        moving: (K, H, W, 2) x and y of samples, of which only derivatives count; None if nothing moves.
-        alpha: (K, H, W, 1) of samples, differentiable; None if they are opaque.
+        samples: see `Picture`; one at least.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
         camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
+        opaque: see `Picture`.
     """
     xp, there, still = namespace(depth), row >= 0, stopped(camera)
     count = xp.sum(xp.astype(there, depth.dtype))
@@ -117,9 +124,7 @@ def picture_of(
     unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
     of_layers = [depth_planes(even[k, ...], unit[k, ...]) for k in layers]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
-    cells: Array = xp.zeros_like(planes[..., :2]) if moving is None else moving
-    cells = cells if alpha is None else xp.concat([cells, alpha], axis=-1)
-    return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, lens, size)
+    return Picture(camera, samples, row, planes, lens, size, opaque)
 
 
 def _lens(camera: Camera, middle: Array) -> Array:

@@ -12,6 +12,7 @@ import rts
 from rts import shadows
 from rts.diagnostics.example_shapes import box, icosphere
 from rts.operations.coverage import COVERAGE
+from rts.operations.depth_limits import FAR, NEARER
 from rts.operations.depth_planes import PLANES
 from rts.testing import OperationConformance
 
@@ -263,16 +264,23 @@ class TestCoverage(OperationConformance):
         rng = np.random.default_rng(0)
         height, width = 9, 11
         near = rng.random((height, width)) < 0.4
-        planes = np.zeros((height, width, 8))
-        planes[..., 0] = np.where(near, rng.uniform(-1, 0, (height, width)), 8.0) + 0.2 * np.arange(width)
-        planes[..., 1], planes[..., 2] = rng.random((height, width)) < 0.9, 0.2
-        planes[..., 4:] = rng.uniform(0, 1, (height, width, 4))
+        planes = np.zeros((9, height, width))
+        planes[0] = np.where(near, rng.uniform(-1, 0, (height, width)), 8.0) + 0.2 * np.arange(width)
+        planes[1], planes[2] = rng.random((height, width)) < 0.9, 0.2
+        planes[4:8] = rng.uniform(0, 1, (4, height, width))
+        limit = planes[0] + NEARER * (1 + 0.2) - 0.2 * (np.arange(width) + 0.5)
+        planes[8] = np.where(planes[1] > 0, limit, FAR)
         # Some of them beside the picture, some before its near plane.
         points = np.stack([rng.uniform(-1, 8, 40), rng.uniform(-1, 6, 40), np.zeros(40)], axis=1)
         points[:, 2] = 1 / (1 / 3 - (8.0 + 0.2 * (points[:, 0] + 1.5)) / 24)
         points[::9, 2] = 0.1
-        cells = np.concatenate([np.zeros((height * width, 2)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
-        return [cells, points, planes, np.array([0.0, 1 / 3, 3.0, 0.2])]
+        samples = np.concatenate([np.zeros((height * width, 2)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
+        row = np.where(planes[1] > 0, rng.permutation(height * width).reshape(height, width), -1).astype(np.int32)
+        return [samples, points, row, planes, np.array([0.0, 1 / 3, 3.0, 0.2])]
+
+    @pytest.fixture(params=[True, False])
+    def params(self, request):
+        return {"opaque": request.param}
 
 
 @pytest.mark.parametrize(
