@@ -230,8 +230,15 @@ LOOPS = [
     Defect(
         "composites behind a layer are those behind the next",
         "rts/splatting/edges/stacks_loops.py",
-        "back = rgba[n, c] + (1 - rgba[n, alpha]) * back",
-        "back = (1 - rgba[n, alpha]) * back",
+        "behind[k - 1, c] = rgba[n, c] + passed * behind[k, c]",
+        "behind[k - 1, c] = passed * behind[k, c]",
+        "edges_operations edges_glass",
+    ),
+    Defect(
+        "what ends beside a break moves as layers that go on",
+        "rts/splatting/edges/stacks_loops.py",
+        "ends &= stack[b, 1 - i, other_layer] != m",
+        "ends &= stack[b, i, other_layer] != m",
         "edges_operations edges_glass",
     ),
     Defect(
@@ -380,10 +387,10 @@ ARRAYS = [
     ),
     Defect(
         "layers beside a break move twice",
-        "rts/splatting/edges/stacks.py",
-        "change = change - stopped(stack.whole - here.whole) * with_break[:, None]",
-        "change = change + stopped(stack.whole - here.whole) * with_break[:, None]",
-        "edges_glass",
+        "rts/splatting/edges/stack_sides.py",
+        "change = change - stopped(there.whole - here.whole) * with_break[:, None]",
+        "change = change + stopped(there.whole - here.whole) * with_break[:, None]",
+        "edges_operations",
     ),
     Defect(
         "merging counts rows of the part before twice",

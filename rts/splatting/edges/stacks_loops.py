@@ -79,11 +79,11 @@ def cells(first, last, rgba, row, out):
                 out[0, y, x, c] = out[1, y, x, c] = 0.0
             light = 1.0
             for k in range(len(row)):
-                if row[k, y, x] >= 0 and light > 0:
-                    n = np.uint32(row[k, y, x])
-                    for c in range(alpha + 1):
-                        out[0, y, x, c] += light * rgba[n, c]
-                    light *= 1 - rgba[n, alpha]
+                n = np.uint32(max(row[k, y, x], 0))
+                light = light if row[k, y, x] >= 0 and light > 0 else 0.0
+                for c in range(alpha + 1):
+                    out[0, y, x, c] += light * rgba[n, c]
+                light *= 1 - rgba[n, alpha]
 
 
 @loop
@@ -239,20 +239,20 @@ def push_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_poi
     """Add to `out` (H, W, C) how composites change beside breaks as samples move, see `stack_sides`."""
     normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
     _fill_normals(gap, place, ties, normal)
-    for b in range(len(gap)):
-        for i in range(2):
-            if not (ends[b, i] and stack[b, i, 0] >= 0):
-                continue
-            cell, beyond, share = _cells_of(gap, place, b, i)
-            _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
-            for k in range(len(row) + 1):
-                motion = 0.0
-                for n in movers[k]:
-                    if n >= 0:
-                        motion += moves[k, 0] * t_positions[n, 0] + moves[k, 1] * t_positions[n, 1]
-                for c in range(rgba.shape[1]):
-                    out[cell[0], cell[1], c] += share * change[k, c] * motion
-                    out[beyond[0], beyond[1], c] += (1 - share) * change[k, c] * motion
+    for side in range(2 * len(gap)):
+        b, i = side // 2, side % 2
+        if not (ends[b, i] and stack[b, i, 0] >= 0):
+            continue
+        cell, beyond, share = _cells_of(gap, place, b, i)
+        _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
+        for k in range(len(row) + 1):
+            motion = 0.0
+            for n in movers[k]:
+                if n >= 0:
+                    motion += moves[k, 0] * t_positions[n, 0] + moves[k, 1] * t_positions[n, 1]
+            for c in range(rgba.shape[1]):
+                out[cell[0], cell[1], c] += share * change[k, c] * motion
+                out[beyond[0], beyond[1], c] += (1 - share) * change[k, c] * motion
 
 
 @loop
@@ -260,18 +260,18 @@ def pull_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_poi
     """Add to gradients of positions those of `push_sides`."""
     normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
     _fill_normals(gap, place, ties, normal)
-    for b in range(len(gap)):
-        for i in range(2):
-            if not (ends[b, i] and stack[b, i, 0] >= 0):
-                continue
-            cell, beyond, share = _cells_of(gap, place, b, i)
-            _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
-            for k in range(len(row) + 1):
-                total = 0.0
-                for c in range(rgba.shape[1]):
-                    mixed = share * g[cell[0], cell[1], c] + (1 - share) * g[beyond[0], beyond[1], c]
-                    total += change[k, c] * mixed
-                for n in movers[k]:
-                    if n >= 0:
-                        g_positions[n, 0] += moves[k, 0] * total
-                        g_positions[n, 1] += moves[k, 1] * total
+    for side in range(2 * len(gap)):
+        b, i = side // 2, side % 2
+        if not (ends[b, i] and stack[b, i, 0] >= 0):
+            continue
+        cell, beyond, share = _cells_of(gap, place, b, i)
+        _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
+        for k in range(len(row) + 1):
+            total = 0.0
+            for c in range(rgba.shape[1]):
+                mixed = share * g[cell[0], cell[1], c] + (1 - share) * g[beyond[0], beyond[1], c]
+                total += change[k, c] * mixed
+            for n in movers[k]:
+                if n >= 0:
+                    g_positions[n, 0] += moves[k, 0] * total
+                    g_positions[n, 1] += moves[k, 1] * total
