@@ -12,8 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-FINE = 1e-4
+FINE = 1e-3
 """Length of the interval, in cells, in which a break is known to lie."""
+
+AT_ONCE, FEW = (2, 8), 1024
+"""Halvings for which a scene is sampled at once, at least and at most, and samples that cost little beside a call."""
 
 INNER = 0.1
 """Distance from a break, in cells, of the samples that tell colours; half the way to the next break if that is less."""
@@ -24,6 +27,11 @@ BESIDE = 0.05
 STEEP, RISE = 1.5, 0.1
 """Two layers of a part may be two surfaces if their depths differ by more than so many times the least difference
 beside them, plus this share of a cell's width."""
+
+
+ROOT = 2.5
+"""A layer of a part is one surface if its depths change in a half by at most so many times the change in the other,
+plus `RISE`: towards a smooth outline depths change as a square root, in its half by 1 + √2 times as much."""
 
 
 class Fronts(NamedTuple):
@@ -59,10 +67,13 @@ class Oracle(NamedTuple):
     Attributes:
         layers: points (M, 2) → the K layers there, nothing behind an opaque one.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+        beyond: fronts (M,), the points (M, 2) at which they are seen, unit steps (M, 2) → how far along the steps the
+            outlines of their parts are expected, and their depths; NaN where nothing is known.
     """
 
     layers: Callable[[np.ndarray], Fronts]
     width: np.ndarray
+    beyond: Callable[[Fronts, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     def widths(self, depth: np.ndarray) -> np.ndarray:
         """The width of cells at depths."""
@@ -261,23 +272,63 @@ def _level(a: Fronts, b: Fronts, oracle: Oracle) -> np.ndarray:
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     """Intervals halved until they are `FINE`; a half whose ends see the same surfaces is dropped.
 
-    A scene is sampled for two halvings at once: fewer calls cost less than the samples that prove to be of no use.
+    A scene is sampled for several halvings at once: fewer calls cost less than the samples that prove to be of no use.
     """
-    finished = []
+    found, finished = _guessed(found, gaps, oracle), []
     while True:
         fine = found.high - found.low <= FINE
         finished.append(found.at(np.flatnonzero(fine)))
         found = found.at(np.flatnonzero(~fine))
         if not len(found.gap):
             break
-        middle, quarter = (found.low + found.high) / 2, (found.high - found.low) / 4
-        places = middle - quarter, middle, middle + quarter
-        gap = np.concatenate([found.gap] * len(places))
-        seen = oracle.layers(gaps.points(gap, np.concatenate(places)))
-        low, middle, high = np.arange(len(gap)).reshape(len(places), -1)
-        found, (first, second) = _halves(found, seen.at(middle), oracle)
-        found, _ = _halves(found, seen.at(np.concatenate([low[first], high[second]])), oracle)
+        count = len(found.gap)
+        times = int(np.clip(np.log2(FEW / count), *AT_ONCE))
+        parts = 2**times
+        places = found.low + (found.high - found.low) * np.arange(1, parts)[:, None] / parts
+        seen = oracle.layers(gaps.points(np.tile(found.gap, parts - 1), places.reshape(-1)))
+        # Of each half, the interval that it is of, and where in it it begins.
+        interval, begin = np.arange(count), np.zeros(count, int)
+        for step in parts // 2 ** np.arange(1, times + 1):
+            middle = begin + step
+            found, kept = _halves(found, seen.at((middle - 1) * count + interval), oracle)
+            interval = np.concatenate([interval[k] for k in kept])
+            begin = np.concatenate([begin[kept[0]], middle[kept[1]]])
     return _Intervals.of(finished)
+
+
+def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
+    """Intervals cut close before and behind outlines that parts tell of, as samples there prove; others stay whole."""
+    a, b = (Fronts(*(x[0] for x in side)) for side in (found.before, found.behind))
+    behind = (b.part >= 0) & ((a.part < 0) | (b.depth < a.depth))
+    fronts = Fronts(*(np.where(behind, y, x) for x, y in zip(a, b, strict=True)))
+    start, way = np.where(behind, found.high, found.low), np.where(behind, -1.0, 1.0)
+    away, depth = oracle.beyond(fronts, gaps.points(found.gap, start), way[:, None] * gaps.step[found.gap])
+    low, high = (start + way * away + side * 0.49 * FINE for side in (-1, 1))
+    cut = (low > found.low) & (high < found.high)  # False for NaN.
+    # A front goes on unless it has an outline in between.
+    level = _level(found.before, found.behind, oracle)
+    level[0] |= (a.part == b.part) & ((high < found.low) | (low > found.high))
+    rest = found.at(np.flatnonzero(~cut & ~level.all(0)))
+    some, depth, low, high = found.at(np.flatnonzero(cut)), depth[cut], low[cut], high[cut]
+    count = len(low)
+    if not count:
+        return rest
+    gap = np.concatenate([some.gap] * 2)
+    seen = oracle.layers(gaps.points(gap, np.concatenate([low, high])))
+    first, last = seen.at(slice(None, count)), seen.at(slice(count, None))
+    pieces = [
+        _Intervals(some.gap, some.low, low, some.before, first),
+        _Intervals(some.gap, low, high, first, last),
+        _Intervals(some.gap, high, some.high, last, some.behind),
+    ]
+    whole = [_level(piece.before, piece.behind, oracle) for piece in pieces]
+    # From its start to its outline a front is one surface.
+    fronts, behind = fronts.at(cut), behind[cut]
+    for piece, end, ours in ((0, first, ~behind), (2, last, behind)):
+        near = np.abs(end.depth[0] - depth) <= oracle.widths(depth)
+        whole[piece][0] |= ours & (end.part[0] == fronts.part) & near
+    pieces = [piece.at(np.flatnonzero(~w.all(0))) for piece, w in zip(pieces, whole, strict=True)]
+    return _Intervals.of([rest, *pieces])
 
 
 def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:
@@ -290,10 +341,13 @@ def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Inte
         _Intervals(found.gap, found.low, middle, found.before, in_middle),
         _Intervals(found.gap, middle, found.high, in_middle, found.behind),
     ]
-    # Within the same parts the half in which a depth changes more has the break.
+    # Within the same parts the half in which a depth changes more has the break, if any has.
     alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
-    changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
-    drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
+    changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
+    most, less = np.maximum(*changes), np.minimum(*changes)
+    whole = alike & (most <= ROOT * less + RISE * oracle.widths(in_middle.depth)).all(0)
+    changes = [change.max(0) for change in changes]
+    drop = [whole | _level(half.before, half.behind, oracle).all(0) for half in halves]
     drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
     kept = [np.flatnonzero(~d) for d in drop]
     return _Intervals.of([half.at(index) for half, index in zip(halves, kept, strict=True)]), kept
