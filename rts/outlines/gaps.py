@@ -12,8 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-FINE = 1e-3
+FINE = 1e-4
 """Length of the interval, in cells, in which a break is known to lie."""
+
+GUESSED = 1e-3
+"""Length of the interval, in cells, around a place where a surface tells that its outline lies."""
 
 AT_ONCE, FEW = (2, 8), 1024
 """Halvings for which a scene is sampled at once, at least and at most, and samples that cost little beside a call."""
@@ -274,7 +277,7 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
 
     A scene is sampled for several halvings at once: fewer calls cost less than the samples that prove to be of no use.
     """
-    found, finished = _guessed(found, gaps, oracle), []
+    found, *finished = _guessed(found, gaps, oracle)
     while True:
         fine = found.high - found.low <= FINE
         finished.append(found.at(np.flatnonzero(fine)))
@@ -296,14 +299,17 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     return _Intervals.of(finished)
 
 
-def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals cut close before and behind outlines that parts tell of, as samples there prove; others stay whole."""
+def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[_Intervals, ...]:
+    """Intervals cut before and behind outlines that parts tell of: those to be halved, and the `GUESSED` ones.
+
+    Samples prove that a break lies there; intervals without such a proof are halved.
+    """
     a, b = (Fronts(*(x[0] for x in side)) for side in (found.before, found.behind))
     behind = (b.part >= 0) & ((a.part < 0) | (b.depth < a.depth))
     fronts = Fronts(*(np.where(behind, y, x) for x, y in zip(a, b, strict=True)))
     start, way = np.where(behind, found.high, found.low), np.where(behind, -1.0, 1.0)
     away, depth = oracle.beyond(fronts, gaps.points(found.gap, start), way[:, None] * gaps.step[found.gap])
-    low, high = (start + way * away + side * 0.49 * FINE for side in (-1, 1))
+    low, high = (start + way * away + side * GUESSED / 2 for side in (-1, 1))
     cut = (low > found.low) & (high < found.high)  # False for NaN.
     # A front goes on unless it has an outline in between.
     level = _level(found.before, found.behind, oracle)
@@ -312,7 +318,7 @@ def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     some, depth, low, high = found.at(np.flatnonzero(cut)), depth[cut], low[cut], high[cut]
     count = len(low)
     if not count:
-        return rest
+        return (rest,)
     gap = np.concatenate([some.gap] * 2)
     seen = oracle.layers(gaps.points(gap, np.concatenate([low, high])))
     first, last = seen.at(slice(None, count)), seen.at(slice(count, None))
@@ -323,12 +329,12 @@ def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     ]
     whole = [_level(piece.before, piece.behind, oracle) for piece in pieces]
     # From its start to its outline a front is one surface.
-    fronts, behind = fronts.at(cut), behind[cut]
-    for piece, end, ours in ((0, first, ~behind), (2, last, behind)):
+    fronts, backward = fronts.at(cut), behind[cut]
+    for piece, end, ours in ((0, first, ~backward), (2, last, backward)):
         near = np.abs(end.depth[0] - depth) <= oracle.widths(depth)
         whole[piece][0] |= ours & (end.part[0] == fronts.part) & near
-    pieces = [piece.at(np.flatnonzero(~w.all(0))) for piece, w in zip(pieces, whole, strict=True)]
-    return _Intervals.of([rest, *pieces])
+    before, fine, behind = (piece.at(np.flatnonzero(~w.all(0))) for piece, w in zip(pieces, whole, strict=True))
+    return _Intervals.of([rest, before, behind]), fine
 
 
 def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:

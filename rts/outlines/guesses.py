@@ -11,6 +11,7 @@ from rts.contracts.records import Deepest
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import RaySurface
 from rts.plugin_base import overrides
+from rts.sampling.entries import host_value
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -54,7 +55,7 @@ def outlines_beyond(
         found = Deepest(*found) if found is not None else None
         if found is None or found.outline is None:
             return np.full(count, np.nan), np.full(count, np.nan)
-        outline = engine.to_numpy(camera.project(found.outline, size))
+        outline = host_value(camera.project(found.outline, size))
         # The outline is at right angles to the way to it.
         way = outline[:, :2] - at
         along = (way * steps).sum(-1)

@@ -225,7 +225,8 @@ def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     last = places[outlines.rows[index, np.minimum(outlines.near, 1)]]
     for side in (0, 1):
         np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)
-        assert (pairs[there, side, 2] > last[there, 2] - 1e-4).all()
+        # Rounding moves the hits of rays that graze the surface.
+        assert (pairs[there, side, 2] > last[there, 2] - 5e-4).all()
 
 
 def test_views_together_have_the_gradients_of_views_alone():
