@@ -32,11 +32,6 @@ STEEP, RISE = 1.5, 0.1
 beside them, plus this share of a cell's width."""
 
 
-ROOT = 2.5
-"""A layer of a part is one surface if its depths change in a half by at most so many times the change in the other,
-plus `RISE`: towards a smooth outline depths change as a square root, in its half by 1 + √2 times as much."""
-
-
 class Fronts(NamedTuple):
     """The surfaces seen at M points of the image. Host arrays, (M,) for fronts, (K, M) for K layers, front to back.
 
@@ -289,14 +284,26 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         parts = 2**times
         places = found.low + (found.high - found.low) * np.arange(1, parts)[:, None] / parts
         seen = oracle.layers(gaps.points(np.tile(found.gap, parts - 1), places.reshape(-1)))
+        several = [found.before, *(seen.at(slice(i * count, (i + 1) * count)) for i in range(parts - 1)), found.behind]
+        interval = np.flatnonzero(~_are_smooth(several, oracle))
         # Of each half, the interval that it is of, and where in it it begins.
-        interval, begin = np.arange(count), np.zeros(count, int)
+        found, begin = found.at(interval), np.zeros(len(interval), int)
         for step in parts // 2 ** np.arange(1, times + 1):
             middle = begin + step
             found, kept = _halves(found, seen.at((middle - 1) * count + interval), oracle)
             interval = np.concatenate([interval[k] for k in kept])
             begin = np.concatenate([begin[kept[0]], middle[kept[1]]])
     return _Intervals.of(finished)
+
+
+def _are_smooth(several: Sequence[Fronts], oracle: Oracle) -> np.ndarray:
+    """(M,) True where the same parts are seen in places that follow one another, and depths change about evenly."""
+    part, depth = (np.stack([x[i] for x in several]) for i in (0, 2))
+    change = np.abs(np.diff(depth, axis=0))
+    none = np.full_like(change[:1], np.inf)
+    beside = np.minimum(np.concatenate([none, change[:-1]]), np.concatenate([change[1:], none]))
+    even = change <= STEEP * beside + RISE * oracle.widths(depth[:1])
+    return (part == part[:1]).all((0, 1)) & even.all((0, 1))
 
 
 def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[_Intervals, ...]:
@@ -311,10 +318,7 @@ def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[_Interval
     away, depth = oracle.beyond(fronts, gaps.points(found.gap, start), way[:, None] * gaps.step[found.gap])
     low, high = (start + way * away + side * GUESSED / 2 for side in (-1, 1))
     cut = (low > found.low) & (high < found.high)  # False for NaN.
-    # A front goes on unless it has an outline in between.
-    level = _level(found.before, found.behind, oracle)
-    level[0] |= (a.part == b.part) & ((high < found.low) | (low > found.high))
-    rest = found.at(np.flatnonzero(~cut & ~level.all(0)))
+    rest = found.at(np.flatnonzero(~cut))
     some, depth, low, high = found.at(np.flatnonzero(cut)), depth[cut], low[cut], high[cut]
     count = len(low)
     if not count:
@@ -347,13 +351,10 @@ def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Inte
         _Intervals(found.gap, found.low, middle, found.before, in_middle),
         _Intervals(found.gap, middle, found.high, in_middle, found.behind),
     ]
-    # Within the same parts the half in which a depth changes more has the break, if any has.
+    # Within the same parts the half in which a depth changes more has the break.
     alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
-    changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
-    most, less = np.maximum(*changes), np.minimum(*changes)
-    whole = alike & (most <= ROOT * less + RISE * oracle.widths(in_middle.depth)).all(0)
-    changes = [change.max(0) for change in changes]
-    drop = [whole | _level(half.before, half.behind, oracle).all(0) for half in halves]
+    changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
+    drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
     drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
     kept = [np.flatnonzero(~d) for d in drop]
     return _Intervals.of([half.at(index) for half, index in zip(halves, kept, strict=True)]), kept
