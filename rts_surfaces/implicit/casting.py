@@ -75,8 +75,8 @@ def cast(
 
     With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
     lead over the surface. Without L all steps are of one length. In both cases parts thinner than a step may be missed.
-    Where an engine of the CPU compiles eager operations for each shape, NumPy takes the steps, and the engine computes
-    levels, of few shapes, and parameters.
+    On the CPU NumPy takes the steps, whose operations on few rays cost it less. The engine computes levels, of few shapes
+    if it compiles for each, and parameters.
 
     Args:
         level: points (M, 3) → (M,), negative inside, zero counts as outside.
@@ -93,7 +93,7 @@ def cast(
     """
     engine = engine_of(origins)
     xp = engine.namespace
-    if engine.room(1, origins) > 1 and engine.on_host(origins) and origins.shape[0]:
+    if not isinstance(origins, np.ndarray) and engine.on_host(origins) and origins.shape[0]:
         options = {"within": within, "lipschitz": lipschitz, "steps": steps}
         with suppress(_Unknown):
             return _cast_on_host(level, describe, origins, directions, layers, options)
@@ -143,7 +143,7 @@ def _cast_on_host(
         return hits.hit, hits.distance, hits.entering
 
     grid = layers, origins.shape[0]
-    specs = [ArraySpec(grid, dtype) for dtype in (bool, np.dtype(str(origins.dtype)), bool)]
+    specs = [ArraySpec(grid, dtype) for dtype in (bool, np.dtype(str(origins.dtype).rpartition(".")[2]), bool)]
     hit, distance, entering = engine.call_host(found, specs, origins, directions)
     xp = engine.namespace
     points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
