@@ -12,7 +12,7 @@ import numpy as np
 from rts import engine_of, namespace
 from rts.plugin_api.arrays import Array, map_leaves
 from rts.plugin_api.operations import gradient
-from rts.plugin_api.records import ArraySpec, RayHits
+from rts.plugin_api.records import RayHits
 from rts_surfaces.implicit.regions import Region
 
 Level = Callable[[Array], Array]
@@ -75,8 +75,8 @@ def cast(
 
     With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
     lead over the surface. Without L all steps are of one length. In both cases parts thinner than a step may be missed.
-    On the CPU NumPy takes the steps, whose operations on few rays cost it less. The engine computes levels, of few shapes
-    if it compiles for each, and parameters.
+    On the CPU NumPy takes the steps, whose operations on few rays cost it less. The engine computes levels, of few
+    shapes if it compiles for each, and parameters.
 
     Args:
         level: points (M, 3) → (M,), negative inside, zero counts as outside.
@@ -116,7 +116,7 @@ def cast(
 
 
 class _Unknown(Exception):
-    """A level is traced, though rays are known, as under an eager `vmap` over θ."""
+    """Rays or levels are traced, these perhaps alone, as under an eager `vmap` over θ."""
 
 
 def _cast_on_host(
@@ -125,9 +125,12 @@ def _cast_on_host(
     """See `cast`: NumPy takes the steps.
 
     Raises:
-        _Unknown: the level is traced.
+        _Unknown: rays or levels are traced.
     """
     engine = engine_of(origins)
+    rays = [engine.known(x) for x in (origins, directions)]
+    if any(x is None for x in rays):
+        raise _Unknown
 
     def known(points: np.ndarray) -> np.ndarray:
         count = len(points)
@@ -137,14 +140,9 @@ def _cast_on_host(
             raise _Unknown
         return np.asarray(values[:count], points.dtype)
 
-    def found(origins: np.ndarray, directions: np.ndarray) -> tuple[Any, ...]:
-        # Parameters of no columns stand for those that the engine computes.
-        hits = cast(known, lambda points, hit: points[:, :0], origins, directions, layers, **options)
-        return hits.hit, hits.distance, hits.entering
-
-    grid = layers, origins.shape[0]
-    specs = [ArraySpec(grid, dtype) for dtype in (bool, np.dtype(str(origins.dtype).rpartition(".")[2]), bool)]
-    hit, distance, entering = engine.call_host(found, specs, origins, directions)
+    # Parameters of no columns stand for those that the engine computes.
+    hits, grid = cast(known, lambda points, hit: points[:, :0], *rays, layers, **options), (layers, origins.shape[0])
+    hit, distance, entering = (engine.constant(x, origins) for x in (hits.hit, hits.distance, hits.entering))
     xp = engine.namespace
     points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
     params = describe(points, xp.reshape(hit, (-1,)))
