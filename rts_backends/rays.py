@@ -92,7 +92,7 @@ def _with_deepest(
     xp, engine, rows = namespace(samples.ids), engine_of(samples.ids), samples.ids.shape[0]
     result = surface.deepest(theta, points, directions, reach)
     assert result is not None
-    params, there, *_ = result
+    params, there = result
     count = params.shape[0]
     first = engine.constant(np.arange(rows, rows + 2 * count, 2, dtype=np.int32), samples.ids)
     pair = xp.where((there & begins & (samples.row[0, 0, :] >= 0))[None, :], xp.stack([first, first + 1]), -1)

@@ -83,21 +83,6 @@ class RayHits(NamedTuple):
     entering: Array | None = None
 
 
-class Deepest(NamedTuple):
-    """What a surface tells of the deepest points of R rays, see `RaySurface.deepest`.
-
-    Attributes:
-        params: (R, 2, P), the `Samples.params` of a pair of samples beside the deepest point; their hits have no ids.
-        there: (R,) bool, rays that have a pair.
-        outline: (R, 3), local space, where the outline lies next to the deepest point, to first order; NaN where it is
-            not known. Outlines are then looked for there, and nowhere else, which takes fewer rays. None if unknown.
-    """
-
-    params: Array
-    there: Array
-    outline: Array | None = None
-
-
 ON_RAYS = "points on rays"
 """Name of a table (N, 3) float32, for samples that are not centred: points of the cells' rays at the samples' depths,
 local space."""

@@ -16,7 +16,7 @@ from rts.arrays.array_functions import from_numbers
 from rts.arrays.engines import engine_of, stopped
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
-from rts.contracts.records import ArraySpec, Deepest, Proxy, RayHits, Samples
+from rts.contracts.records import ArraySpec, Proxy, RayHits, Samples
 from rts.errors import InputError
 from rts.plugin_base import Plugin, overrides
 from rts.scene.camera import Camera
@@ -290,7 +290,7 @@ class RaySurface(Surface):
 
     def deepest(
         self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
-    ) -> Deepest | tuple[Array, Array] | None:
+    ) -> tuple[Array, Array] | None:
         """Pairs of samples beside the deepest points of rays; they tell splatters how outlines of fields move.
 
         A ray enters a solid at a point of its surface. The field is least at the deepest point of the chord that begins
@@ -299,11 +299,12 @@ class RaySurface(Surface):
 
         Args:
             theta: θ without derivatives.
-            points: (R, 3), points of the surface, or such between one and the deepest point, local space.
+            points: (R, 3), points of the surface, local space.
             directions: (R, 3), the rays' directions, of any length.
             reach: (R,), the distance from the ray beyond which an outline is of no interest, local units.
 
         Returns:
-            A `Deepest`, or its first two fields. None, the default, for surfaces without a field.
+            `Samples.params` (R, 2, P) of the pairs, for surfaces whose hits have no ids, and marks (R,) bool of rays
+            that have a pair. None, the default, for surfaces without a field.
         """
         return None

@@ -15,12 +15,6 @@ import numpy as np
 FINE = 1e-4
 """Length of the interval, in cells, in which a break is known to lie."""
 
-GUESSED = 1e-3
-"""Length of the interval, in cells, around a place where a surface tells that its outline lies."""
-
-AT_ONCE, FEW = (2, 8), 1024
-"""Halvings for which a scene is sampled at once, at least and at most, and samples that cost little beside a call."""
-
 INNER = 0.1
 """Distance from a break, in cells, of the samples that tell colours; half the way to the next break if that is less."""
 
@@ -65,13 +59,10 @@ class Oracle(NamedTuple):
     Attributes:
         layers: points (M, 2) → the K layers there, nothing behind an opaque one.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-        beyond: fronts (M,), the points (M, 2) at which they are seen, unit steps (M, 2) → how far along the steps the
-            outlines of their parts are expected, and their depths; NaN where nothing is known.
     """
 
     layers: Callable[[np.ndarray], Fronts]
     width: np.ndarray
-    beyond: Callable[[Fronts, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     def widths(self, depth: np.ndarray) -> np.ndarray:
         """The width of cells at depths."""
@@ -268,77 +259,38 @@ def _level(a: Fronts, b: Fronts, oracle: Oracle) -> np.ndarray:
 
 
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals halved until they are `FINE`; a half whose ends see the same surfaces is dropped.
+    """Intervals halved until they are `FINE`; those in which surfaces go on, and halves with level ends, are dropped.
 
-    A scene is sampled for several halvings at once: fewer calls cost less than the samples that prove to be of no use.
+    A scene is sampled for two halvings at once: fewer calls cost less than the samples that prove to be of no use.
     """
-    found, *finished = _guessed(found, gaps, oracle)
+    finished = []
     while True:
         fine = found.high - found.low <= FINE
         finished.append(found.at(np.flatnonzero(fine)))
         found = found.at(np.flatnonzero(~fine))
         if not len(found.gap):
             break
-        count = len(found.gap)
-        times = int(np.clip(np.log2(FEW / count), *AT_ONCE))
-        parts = 2**times
-        places = found.low + (found.high - found.low) * np.arange(1, parts)[:, None] / parts
-        seen = oracle.layers(gaps.points(np.tile(found.gap, parts - 1), places.reshape(-1)))
-        several = [found.before, *(seen.at(slice(i * count, (i + 1) * count)) for i in range(parts - 1)), found.behind]
-        interval = np.flatnonzero(~_are_smooth(several, oracle))
-        # Of each half, the interval that it is of, and where in it it begins.
-        found, begin = found.at(interval), np.zeros(len(interval), int)
-        for step in parts // 2 ** np.arange(1, times + 1):
-            middle = begin + step
-            found, kept = _halves(found, seen.at((middle - 1) * count + interval), oracle)
-            interval = np.concatenate([interval[k] for k in kept])
-            begin = np.concatenate([begin[kept[0]], middle[kept[1]]])
+        middle, quarter = (found.low + found.high) / 2, (found.high - found.low) / 4
+        places = middle - quarter, middle, middle + quarter
+        gap = np.concatenate([found.gap] * len(places))
+        seen = oracle.layers(gaps.points(gap, np.concatenate(places)))
+        low, middle, high = np.arange(len(gap)).reshape(len(places), -1)
+        steps = [found.before, *map(seen.at, (low, middle, high)), found.behind]
+        broken = np.flatnonzero(~_goes_on(steps, oracle))
+        found, low, middle, high = found.at(broken), low[broken], middle[broken], high[broken]
+        found, (first, second) = _halves(found, seen.at(middle), oracle)
+        found, _ = _halves(found, seen.at(np.concatenate([low[first], high[second]])), oracle)
     return _Intervals.of(finished)
 
 
-def _are_smooth(several: Sequence[Fronts], oracle: Oracle) -> np.ndarray:
-    """(M,) True where the same parts are seen in places that follow one another, and depths change about evenly."""
-    part, depth = (np.stack([x[i] for x in several]) for i in (0, 2))
+def _goes_on(steps: Sequence[Fronts], oracle: Oracle) -> np.ndarray:
+    """(M,) True where the layers at places that follow one another change about evenly; see `STEEP`."""
+    part, depth = (np.stack([x[i] for x in steps]) for i in (0, 2))
     change = np.abs(np.diff(depth, axis=0))
     none = np.full_like(change[:1], np.inf)
     beside = np.minimum(np.concatenate([none, change[:-1]]), np.concatenate([change[1:], none]))
     even = change <= STEEP * beside + RISE * oracle.widths(depth[:1])
     return (part == part[:1]).all((0, 1)) & even.all((0, 1))
-
-
-def _guessed(found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[_Intervals, ...]:
-    """Intervals cut before and behind outlines that parts tell of: those to be halved, and the `GUESSED` ones.
-
-    Samples prove that a break lies there; intervals without such a proof are halved.
-    """
-    a, b = (Fronts(*(x[0] for x in side)) for side in (found.before, found.behind))
-    behind = (b.part >= 0) & ((a.part < 0) | (b.depth < a.depth))
-    fronts = Fronts(*(np.where(behind, y, x) for x, y in zip(a, b, strict=True)))
-    start, way = np.where(behind, found.high, found.low), np.where(behind, -1.0, 1.0)
-    away, depth = oracle.beyond(fronts, gaps.points(found.gap, start), way[:, None] * gaps.step[found.gap])
-    low, high = (start + way * away + side * GUESSED / 2 for side in (-1, 1))
-    cut = (low > found.low) & (high < found.high)  # False for NaN.
-    rest = found.at(np.flatnonzero(~cut))
-    some, depth, low, high = found.at(np.flatnonzero(cut)), depth[cut], low[cut], high[cut]
-    count = len(low)
-    if not count:
-        return (rest,)
-    gap = np.concatenate([some.gap] * 2)
-    seen = oracle.layers(gaps.points(gap, np.concatenate([low, high])))
-    first, last = seen.at(slice(None, count)), seen.at(slice(count, None))
-    pieces = [
-        _Intervals(some.gap, some.low, low, some.before, first),
-        _Intervals(some.gap, low, high, first, last),
-        _Intervals(some.gap, high, some.high, last, some.behind),
-    ]
-    whole = [_level(piece.before, piece.behind, oracle) for piece in pieces]
-    # From its start to its outline a front is one surface.
-    fronts, backward = fronts.at(cut), behind[cut]
-    for piece, end, ours in ((0, first, ~backward), (2, last, backward)):
-        near = np.abs(end.depth[0] - depth) <= oracle.widths(depth)
-        whole[piece][0] |= ours & (end.part[0] == fronts.part) & near
-    before, fine, behind = (piece.at(np.flatnonzero(~w.all(0))) for piece, w in zip(pieces, whole, strict=True))
-    return _Intervals.of([rest, before, behind]), fine
 
 
 def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:

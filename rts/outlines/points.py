@@ -18,7 +18,6 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Found
 from rts.outlines.gaps import Breaks, Fronts, Oracle, find_breaks
-from rts.outlines.guesses import outlines_beyond, tells_outlines
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import breaks_of_triangles
@@ -194,7 +193,7 @@ class Points:
         elif known:
             breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
         else:
-            oracle = Oracle(functools.partial(self._layers, count=count), self._width, self._beyond)
+            oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
         if count == 1 or stacks is None:
             # For each break the two last samples, and the two that tell colours, if there are several.
@@ -270,16 +269,6 @@ class Points:
         taken = taken_rows(samples, constant(np.maximum(found, 0).reshape(-1).astype(np.int32), samples.row))
         row = constant(number.astype(np.int32)[:, None], samples.row)
         return taken.replace(row=row, depth=constant(depth[:, None], samples.depth))
-
-    def _beyond(self, fronts: Fronts, points: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Oracle.beyond`."""
-        away, depth = np.full(len(points), np.nan), np.full(len(points), np.nan)
-        for index, (sampler, camera, *_) in enumerate(self._parts):
-            at, part = np.flatnonzero(fronts.part == index), self._scene.parts[index]
-            if len(at) and tells_outlines(part, sampler):
-                of_part = points[at], fronts.depth[at], steps[at]
-                away[at], depth[at] = outlines_beyond(part, camera, self._grid.size, *of_part)
-        return away, depth
 
     def _layers(self, points: np.ndarray, count: int) -> Fronts:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 
 from rts import engine_of
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.operations import gradient
-from rts.plugin_api.records import Deepest
 from rts_surfaces.implicit.casting import without_derivative
 
 MARCH, FIRST, GROWTH = 10, 1 / 12, 2.0
@@ -29,7 +27,7 @@ def deepest(
     points: Array,
     directions: Array,
     reach: Array,
-) -> Deepest:
+) -> tuple[Array, Array]:
     """Pairs of samples beside the deepest points of rays; see `rts.RaySurface.deepest`.
 
     Let s₋ ≤ 0 and s₊ ≥ 0 be the slopes of the level f along the ray just before and just behind the deepest point, and
@@ -41,12 +39,13 @@ def deepest(
     Args:
         level: points (M, 3) → (M,), negative inside.
         free: points (M, 3) → marks (M,) bool of points whose level follows θ; others have no motion.
-        points: (R, 3), points of the surface at which rays enter, or such between them and the deepest points.
+        points: (R, 3), points of the surface at which rays enter.
         directions: (R, 3).
         reach: (R,), the farthest distance of outlines.
 
     Returns:
-        Parameters are points, motions for each unit of level, and levels.
+        Parameters (R, 2, 7): points, motions for each unit of level, and levels; and marks (R,) bool of rays with a
+        pair.
     """
     engine = engine_of(points)
     xp = engine.namespace
@@ -101,9 +100,8 @@ def deepest(
     across = across - xp.sum(across * along, axis=-1, keepdims=True) * along
     square = xp.sum(across * across, axis=-1)
     far = -(levels[0] + levels[1]) / 2 / largest
-    known = passed & (square > 0)
-    near = known & (far * far < reach * reach * square)
-    move = across / (xp.where(known, square, 1.0) * largest)[:, None]
+    near = passed & (square > 0) & (far * far < reach * reach * square)
+    move = across / (xp.where(near, square, 1.0) * largest)[:, None]
     pair = []
     for t, part, value in zip(sides, (2 * share, 2 - 2 * share), levels, strict=True):
         place = at(t)
@@ -111,6 +109,4 @@ def deepest(
         pair.append(xp.concat([place, part[:, None] * move, value[:, None]], axis=-1))
     params = xp.stack(pair, axis=1)
     near = near & xp.all(xp.isfinite(params), axis=(1, 2))
-    outline = (at(sides[0]) + at(sides[1])) / 2 - move * ((levels[0] + levels[1]) / 2)[:, None]
-    params, outline = xp.where(near[:, None, None], params, 0.0), xp.where(known[:, None], outline, math.nan)
-    return Deepest(*map(engine.stop_gradient, (params, near, outline)))
+    return engine.stop_gradient(xp.where(near[:, None, None], params, 0.0)), near

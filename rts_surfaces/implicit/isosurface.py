@@ -19,7 +19,7 @@ from rts import GBuffer, InputError, Part, RaySurface, TriangleSurface, engine_o
 from rts.plugin_api.arrays import Array, Tree, from_numbers, map_leaves, unit
 from rts.plugin_api.checks import check_positive, fingerprint, quoted
 from rts.plugin_api.operations import gradient
-from rts.plugin_api.records import ArraySpec, Deepest, Proxy, Rate, RayHits, Rays, Samples
+from rts.plugin_api.records import ArraySpec, Proxy, Rate, RayHits, Rays, Samples
 from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
 from rts_surfaces.implicit.casting import cast, per_level
@@ -312,7 +312,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             steps=int(np.ceil(steps)) if self.lipschitz is None else None,
         )
 
-    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> Deepest:
+    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; caps do not move."""
         points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level = partial(self._capped if self.closed else self.field.level, theta)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rts import GBuffer, InputError, Part, RaySurface, namespace
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_numbers, check_positive, is_count, quoted
-from rts.plugin_api.records import Deepest, RayHits, Samples
+from rts.plugin_api.records import RayHits, Samples
 from rts_surfaces.implicit.casting import cast, moving
 from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
@@ -100,7 +100,7 @@ class Sdf(Implicit, RaySurface):
         """Positions, "normal" of unit length, outwards, and the attributes."""
         return self.at_hits(theta, samples)
 
-    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> Deepest:
+    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; in θ's dtype."""
         points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level, xp = partial(self.field.level, theta), namespace(points)

@@ -159,7 +159,7 @@ def unit_rays(count, seed=0):
 def test_the_deepest_point_of_a_ball_is_nearest_to_its_centre(target):
     points, directions, off = unit_rays(50)
     given = (arrays(target, x, np.float64) for x in (points, directions, np.full(50, 0.5)))
-    params, there, _ = map(to_numpy, deepest(lambda p: length(p) - 1, lambda p: p[:, 0] == p[:, 0], *given))
+    params, there = map(to_numpy, deepest(lambda p: length(p) - 1, lambda p: p[:, 0] == p[:, 0], *given))
     np.testing.assert_array_equal(there, 1 - off < 0.5)
     pair, own = params[there].astype(np.float64), points[there] * [1, 1, 0]
     np.testing.assert_allclose(pair[:, :, :3], np.repeat(own[:, None], 2, axis=1), atol=2e-3)
@@ -178,7 +178,7 @@ def test_at_a_kink_each_side_has_its_share():
 
     x = np.array([-0.02, -0.1])
     points = np.stack([x, 0 * x, -x * math.tan(tilts[0, 0])], axis=1)
-    params, there, _ = deepest(level, lambda p: p[:, 0] < 9, points, np.tile([0.0, 0, -1], (2, 1)), np.full(2, 0.5))
+    params, there = deepest(level, lambda p: p[:, 0] < 9, points, np.tile([0.0, 0, -1], (2, 1)), np.full(2, 0.5))
     assert there.all()
     # The edge a · p = b · p = 0 seen along z: level of the ray is the combination without z.
     share = math.cos(tilts[0, 1]) / np.cos(tilts[0]).sum()
@@ -195,9 +195,9 @@ def test_rays_through_the_middle_of_a_wall_have_no_pair():
     def level(p):
         return np.where(p[:, 0] == 0, np.abs(p[:, 2]) - 0.3, 0)
 
-    _, there, _ = deepest(level, lambda p: p[:, 0] < 9, points[:1], directions[:1], np.full(1, 0.5))
+    _, there = deepest(level, lambda p: p[:, 0] < 9, points[:1], directions[:1], np.full(1, 0.5))
     assert not there.any()
-    _, there, _ = deepest(lambda p: p[:, 2], lambda p: p[:, 0] < 9, points[1:], directions[1:], np.full(1, 0.5))
+    _, there = deepest(lambda p: p[:, 2], lambda p: p[:, 0] < 9, points[1:], directions[1:], np.full(1, 0.5))
     assert not there.any()
 
 
@@ -225,8 +225,7 @@ def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     last = places[outlines.rows[index, np.minimum(outlines.near, 1)]]
     for side in (0, 1):
         np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)
-        # Rounding moves the hits of rays that graze the surface.
-        assert (pairs[there, side, 2] > last[there, 2] - 5e-4).all()
+        assert (pairs[there, side, 2] > last[there, 2] - 1e-4).all()
 
 
 def test_views_together_have_the_gradients_of_views_alone():
