@@ -22,10 +22,10 @@ KEPT, HEAP = 128 << 20, 31 << 20
 def _keep_freed_memory() -> None:
     """Have freed memory serve the next step, whose pages the system would clear anew; glibc alone.
 
-    `MALLOC_TRIM_THRESHOLD_` of the environment turns this off.
+    Settings of the environment go first.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None and "MALLOC_TRIM_THRESHOLD_" not in os.environ:
+    if mallopt is not None and not {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"} & os.environ.keys():
         mallopt(M_TRIM_THRESHOLD, KEPT)
         mallopt(M_MMAP_THRESHOLD, HEAP)
 
