@@ -128,8 +128,8 @@ def _cast_on_host(
         _Unknown: rays or levels are traced.
     """
     engine = engine_of(origins)
-    rays = [engine.known(x) for x in (origins, directions)]
-    if any(x is None for x in rays):
+    starts, ways = engine.known(origins), engine.known(directions)
+    if starts is None or ways is None:
         raise _Unknown
 
     def known(points: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ def _cast_on_host(
         return np.asarray(values[:count], points.dtype)
 
     # Parameters of no columns stand for those that the engine computes.
-    hits, grid = cast(known, lambda points, hit: points[:, :0], *rays, layers, **options), (layers, origins.shape[0])
+    hits, grid = cast(known, lambda points, hit: points[:, :0], starts, ways, layers, **options), (layers, len(starts))
     hit, distance, entering = (engine.constant(x, origins) for x in (hits.hit, hits.distance, hits.entering))
     xp = engine.namespace
     points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))

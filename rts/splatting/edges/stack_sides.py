@@ -160,7 +160,8 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     _, rgba, row, *known = operands
     (t_positions,) = tangents
     out[...] = 0
-    loops.push_sides(rgba, row, *known, read_only(t_positions), out)
+    if t_positions is not None:
+        loops.push_sides(rgba, row, *known, read_only(t_positions), out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
