@@ -90,9 +90,9 @@ def _picture(
     opaque, context = all(scene.opaque), scene.context
     if opaque and sampled.depth is not None and not context.engine.differentiates:
         depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
-        # Nothing moves.
-        samples, row = np.zeros((1, 3), depth.dtype), np.minimum(row, 0)
-        return picture_of(depth, samples, row, place, size, opaque)
+        # Nothing moves, so that one sample stands for all.
+        samples = context.engine.constant(np.zeros((1, 3)), depth)
+        return picture_of(depth, samples, namespace(row).clip(row, None, 0), place, size, opaque)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
     positions, row, engine = splats.positions, splats.row, engine_of(splats.positions)
     place = constants(scene.camera, engine, positions)

@@ -16,7 +16,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 KEPT, HEAP = 128 << 20, 31 << 20
-"""Bytes at the heap's end that stay when they are free; smaller blocks than the second number come from the heap."""
+"""Bytes at a heap's end that stay when they are free; smaller blocks than the second number come from the heap."""
 
 
 def _keep_freed_memory() -> None:
@@ -25,7 +25,8 @@ def _keep_freed_memory() -> None:
     Settings of the environment go first.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None and not {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"} & os.environ.keys():
+    given = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"} & os.environ.keys()
+    if mallopt is not None and not given and "glibc.malloc" not in os.environ.get("GLIBC_TUNABLES", ""):
         mallopt(M_TRIM_THRESHOLD, KEPT)
         mallopt(M_MMAP_THRESHOLD, HEAP)
 

@@ -46,7 +46,10 @@ class GBuffer(dict):
         self._deferred[name] = compute
 
     def unit(self, name: str) -> Any:
-        """An attribute of vectors (N, 3), scaled to length one; a zero vector stays zero. Computed once."""
+        """An attribute of vectors (N, 3), scaled to length one; a zero vector stays zero.
+
+        Computed when first read, like deferred attributes: with the derivatives that it has there.
+        """
         vectors = self[name]
         if name not in self._units or self._units[name][0] is not vectors:
             self._units[name] = vectors, unit(vectors)

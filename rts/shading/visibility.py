@@ -90,6 +90,7 @@ def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
         if outside != 1:
             inside = inside | is_inside(stopped(placed), picture.size, picture.lens)
     share = functools.reduce(operator.mul, shares)[:, 0] if shares else xp.ones_like(points[:, 0])
+    share = xp.astype(share, xp.result_type(share, points), copy=False)
     return share if outside == 1 else xp.where(inside, share, outside)
 
 

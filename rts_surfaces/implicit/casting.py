@@ -129,7 +129,7 @@ def _cast_on_host(
     """
     engine = engine_of(origins)
     starts, ways = engine.known(origins), engine.known(directions)
-    if starts is None or ways is None:
+    if starts is None or ways is None or starts.shape != origins.shape or ways.shape != directions.shape:
         raise _Unknown
 
     def known(points: np.ndarray) -> np.ndarray:
@@ -140,14 +140,22 @@ def _cast_on_host(
             raise _Unknown
         return np.asarray(values[:count], points.dtype)
 
-    # Parameters of no columns stand for those that the engine computes.
-    hits, grid = cast(known, lambda points, hit: points[:, :0], starts, ways, layers, **options), (layers, len(starts))
-    hit, distance, entering = (engine.constant(x, origins) for x in (hits.hit, hits.distance, hits.entering))
+    # Parameters of no columns stand for those that the engine computes, of hits alone.
+    hits = cast(known, lambda points, hit: points[:, :0], starts, ways, layers, **options)
+    _, ray = np.nonzero(hits.hit)
+    count = len(ray)
+    ray = np.concatenate([ray, np.zeros(engine.room(max(1, count), origins) - count, ray.dtype)])
+    far = np.concatenate([hits.distance[hits.hit], np.zeros(len(ray) - count, hits.distance.dtype)])
+    points = engine.constant(starts[ray] + far[:, None] * ways[ray], origins)
+    found = describe(points, engine.constant(np.arange(len(ray)) < count, origins))
+    row = np.zeros(hits.hit.shape, np.int32)
+    row[hits.hit] = np.arange(count)
+    hit, distance, entering, row = (
+        engine.constant(x, origins) for x in (hits.hit, hits.distance, hits.entering, row.reshape(-1))
+    )
     xp = engine.namespace
-    points = xp.reshape(origins + distance[..., None] * directions, (-1, 3))
-    params = describe(points, xp.reshape(hit, (-1,)))
-    params = xp.where(hit[..., None], xp.reshape(params, (*grid, params.shape[-1])), 0.0)
-    return RayHits(hit, distance, params, entering=entering)
+    params = xp.reshape(xp.take(found, row, axis=0), (*hit.shape, found.shape[-1]))
+    return RayHits(hit, distance, xp.where(hit[..., None], params, 0.0), entering=entering)
 
 
 class _Rays(NamedTuple):

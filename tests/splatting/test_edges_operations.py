@@ -121,9 +121,23 @@ class TestCells(OperationConformance):
     def operation(self):
         return CELLS
 
-    @pytest.fixture
-    def operands(self):
-        return operands_of("panes", "CELLS")
+    @pytest.fixture(params=["panes", "panes, some layers empty"])
+    def operands(self, request):
+        positions, rgba, row, joined = operands_of("panes", "CELLS")
+        if request.param != "panes":
+            row = row.copy()
+            row[0, ::3], row[1, :, ::4] = -1, -1
+            assert ((row[0] < 0) & (row[1] >= 0)).any()
+        return [positions, rgba, row, joined]
+
+
+def test_empty_layers_read_no_sample():
+    positions, rgba, row, joined = operands_of("panes", "CELLS")
+    row = row.copy()
+    row[row == 0] = -1
+    assert (row < 0).any()
+    rgba = np.concatenate([np.full_like(rgba[:1], np.nan), rgba[1:]])
+    assert np.isfinite(CELLS(positions, rgba, row, joined)).all()
 
 
 class TestSides(OperationConformance):

@@ -420,3 +420,16 @@ def test_a_function_has_the_arrays_of_jax_that_theta_has():
     both = jax.vmap(lambda r: image({"of": {"radius": r[None]}, "count": 1}))(radii)
     np.testing.assert_array_equal(both[0], expected)
     assert 0 < both[1].sum() < expected.sum()
+
+
+def test_cameras_may_be_batched():
+    torch = pytest.importorskip("torch")
+    part = rts.Part(Sdf(swept_sphere, 1.3, reads=("radii",)), {"radii": torch.tensor([0.9, 0.35])}, "normals")
+    camera = rts.Camera.look_at((0, 1, 4), (0, 0, 0))
+    views = torch.tensor(np.stack([camera.view, rts.Camera.look_at((1, 1, 4), (0, 0, 0)).view]), dtype=torch.float32)
+    projection = torch.tensor(camera.projection, dtype=torch.float32)
+
+    def image(view):
+        return rts.render(part, rts.Camera(view, projection), (16, 16))
+
+    torch.testing.assert_close(torch.func.vmap(image)(views), torch.stack([*map(image, views)]), atol=1e-4, rtol=0)

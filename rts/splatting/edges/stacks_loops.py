@@ -12,19 +12,22 @@ from rts.compiling.loops import compiled, loop
 
 
 @compiled
-def _weigh(rgba, row, y, x, samples, through):
-    """Fill `samples` and `through` (K,), the layers of a cell that light reaches, and the light; returns their number.
-
-    Empty layers come last.
-    """
+def _weigh(rgba, row, y, x, samples, layers, through):
+    """Fill in the samples (K,) of a cell that light reaches, their layers, and the light; returns their number."""
     light, count, alpha = 1.0, 0, rgba.shape[1] - 1
     for k in range(len(row)):
         n = row[k, y, x]
         if n >= 0 and light > 0:
-            samples[count], through[count] = n, light
+            samples[count], layers[count], through[count] = n, k, light
             light *= 1 - rgba[np.uint32(n), alpha]
             count += 1
     return count
+
+
+@compiled
+def _rooms(most, count):
+    """Room for `_weigh` and `_stack`."""
+    return np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most), np.empty((most, count))
 
 
 @compiled
@@ -69,44 +72,49 @@ def _change(rgba, behind, k, light, before, after, c):
     return 0.5 * light * ((rgba[after, c] - rgba[before, c]) - opacity * behind[k, c])
 
 
+@compiled
+def _laid(rgba, n, light, out, y, x):
+    """Add a layer, if there is one, behind those of a cell in `out` (2, H, W, C); returns the light that passes."""
+    if n < 0 or light <= 0:
+        return light
+    for c in range(rgba.shape[1]):
+        out[0, y, x, c] += light * rgba[n, c]
+    return light * (1 - rgba[n, rgba.shape[1] - 1])
+
+
 @loop
 def cells(first, last, rgba, row, out):
     """Fill lines `first` to `last` of `out` (2, H, W, C): composites, and zeros."""
-    alpha = rgba.shape[1] - 1
     for y in range(first, last):
         for x in range(row.shape[2]):
-            for c in range(alpha + 1):
+            for c in range(rgba.shape[1]):
                 out[0, y, x, c] = out[1, y, x, c] = 0.0
             light = 1.0
             for k in range(len(row)):
-                n = np.uint32(max(row[k, y, x], 0))
-                light = light if row[k, y, x] >= 0 and light > 0 else 0.0
-                for c in range(alpha + 1):
-                    out[0, y, x, c] += light * rgba[n, c]
-                light *= 1 - rgba[n, alpha]
+                light = _laid(rgba, row[k, y, x], light, out, y, x)
 
 
 @loop
 def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (2, H, W, C) with the derivative along tangents, see `pull_cells`; empty ones are zeros."""
     most, count = len(row), rgba.shape[1]
-    samples, through, behind = np.empty(most, np.uint32), np.empty(most), np.empty((most, count))
+    samples, layers, through, behind = _rooms(most, count)
     for y in range(first, last):
         for x in range(row.shape[2]):
             for c in range(count):
                 out[0, y, x, c] = out[1, y, x, c] = 0.0
-            layers = _weigh(rgba, row, y, x, samples, through)
-            if layers == 0:
+            reached = _weigh(rgba, row, y, x, samples, layers, through)
+            if reached == 0:
                 continue
-            _stack(rgba, samples, layers, behind)
-            for k in range(layers if len(t_rgba) else 0):
+            _stack(rgba, samples, reached, behind)
+            for k in range(reached if len(t_rgba) else 0):
                 n = samples[k]
                 for c in range(count):
                     out[0, y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, count - 1] * behind[k, c])
-            for k in range(layers if len(t_positions) else 0):
+            for k in range(reached if len(t_positions) else 0):
                 n = samples[k]
-                left, right = _beside(row, joined, k, y, x, 0)
-                up, down = _beside(row, joined, k, y, x, 1)
+                left, right = _beside(row, joined, layers[k], y, x, 0)
+                up, down = _beside(row, joined, layers[k], y, x, 1)
                 for c in range(count):
                     aside = _change(rgba, behind, k, through[k], left, right, c) * t_positions[n, 0]
                     out[1, y, x, c] -= aside + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
@@ -120,22 +128,22 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     """
     most, height, width = row.shape
     count = rgba.shape[1]
-    samples, through, behind = np.empty(most, np.uint32), np.empty(most), np.empty((most, count))
+    samples, layers, through, behind = _rooms(most, count)
     for y in range(height):
         for x in range(width):
-            layers = _weigh(rgba, row, y, x, samples, through)
-            if layers == 0:
+            reached = _weigh(rgba, row, y, x, samples, layers, through)
+            if reached == 0:
                 continue
-            _stack(rgba, samples, layers, behind)
-            for k in range(layers if len(g_rgba) else 0):
+            _stack(rgba, samples, reached, behind)
+            for k in range(reached if len(g_rgba) else 0):
                 n, hidden = samples[k], 0.0
                 for c in range(count):
                     g_rgba[n, c] += through[k] * g[0, y, x, c]
                     hidden += behind[k, c] * g[0, y, x, c]
                 g_rgba[n, count - 1] -= through[k] * hidden
-            for k in range(layers if len(g_positions) else 0):
-                left, right = _beside(row, joined, k, y, x, 0)
-                up, down = _beside(row, joined, k, y, x, 1)
+            for k in range(reached if len(g_positions) else 0):
+                left, right = _beside(row, joined, layers[k], y, x, 0)
+                up, down = _beside(row, joined, layers[k], y, x, 1)
                 if left == right and up == down:
                     continue
                 n, across, along = samples[k], 0.0, 0.0
