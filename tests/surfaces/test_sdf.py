@@ -432,4 +432,4 @@ def test_cameras_may_be_batched():
     def image(view):
         return rts.render(part, rts.Camera(view, projection), (16, 16))
 
-    torch.testing.assert_close(torch.func.vmap(image)(views), torch.stack([*map(image, views)]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(torch.func.vmap(image)(views), torch.stack([*map(image, views)]), atol=5e-4, rtol=0)
