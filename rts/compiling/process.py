@@ -15,6 +15,8 @@ if "OMP_WAIT_POLICY" not in os.environ:
     # GNU's threads spin for some microseconds all the same: to wake one for each operation of torch takes far longer.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""The parameters' numbers in malloc.h."""
 KEPT, HEAP = 128 << 20, 31 << 20
 """Bytes at a heap's end that stay when they are free; smaller blocks than the second number come from the heap."""
 
@@ -30,8 +32,5 @@ def _keep_freed_memory() -> None:
         mallopt(M_TRIM_THRESHOLD, KEPT)
         mallopt(M_MMAP_THRESHOLD, HEAP)
 
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""The parameters' numbers in malloc.h."""
 
 _keep_freed_memory()

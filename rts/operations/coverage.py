@@ -17,7 +17,7 @@ from rts.operations.depth_limits import BIAS, FAR, OWN, REACH
 from rts.operations.operation import Operation
 
 
-def coverage(samples: Array, points: Array, row: Array, planes: Array, lens: Array, opaque: bool = True) -> Array:
+def coverage(samples: Array, points: Array, row: Array, planes: Array, lens: Array, opaque: bool) -> Array:
     """The covered share of points (N, 1), 0 to 1, differentiable in samples and points, to first order.
 
     Points beside the picture or before the near plane are not covered.

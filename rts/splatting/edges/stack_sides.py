@@ -154,23 +154,36 @@ def _forward(operands: Arrays, out: np.ndarray) -> None:
     out[...] = 0
 
 
+def _weights(operands: Arrays) -> Arrays:
+    """The tables of `stacks_loops.weigh_sides`."""
+    from rts.splatting.edges import stacks_loops as loops
+
+    _, rgba, row, *arrays = operands
+    known = _Known(*arrays)
+    rows, sides = len(row) + 1, 2 * len(known.gap)
+    change, moves = np.empty((sides, rows, rgba.shape[1])), np.empty((sides, rows, 2))
+    movers, cells = np.empty((sides, rows, 2), np.int32), np.empty((sides, 2, 2), np.int32)
+    tables = change, moves, movers, cells, np.empty(sides)
+    of_breaks = known.rows, known.gap, known.place, known.ends, known.ties, known.stack
+    loops.weigh_sides(rgba, row, *of_breaks, *tables)
+    return tables
+
+
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     from rts.splatting.edges import stacks_loops as loops
 
-    _, rgba, row, *known = operands
     (t_positions,) = tangents
     out[...] = 0
     if t_positions is not None:
-        loops.push_sides(rgba, row, *known, read_only(t_positions), out)
+        loops.push_sides(*_weights(operands), read_only(t_positions), out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.splatting.edges import stacks_loops as loops
 
-    _, rgba, row, *known = operands
     (g_positions,) = results
     if g_positions is not None:
-        loops.pull_sides(rgba, row, *known, read_only(g), g_positions)
+        loops.pull_sides(*_weights(operands), read_only(g), g_positions)
 
 
 SIDES = Operation(

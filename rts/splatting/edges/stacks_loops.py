@@ -187,11 +187,7 @@ def _color(rgba, n, c):
 
 @compiled
 def _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers):
-    """Fill in how the composite beside a break changes, where samples move.
-
-    It changes by `change` (K + 1, C) times the motion, along `moves` (K + 1, 2), of both `movers` (K + 1, 2), samples
-    or −1. The last row is of the sample that ends there, as if the composite moved with it.
-    """
+    """Fill in the tables of a side, see `weigh_sides`; room for light (K,) and for composites (K, C) is given."""
     layers, count = len(row), rgba.shape[1]
     y, x = cell
     along_x, along_y = (gap[b, 2], 1 - gap[b, 2]) if i == 1 else (-gap[b, 2], gap[b, 2] - 1)
@@ -234,52 +230,66 @@ def _cells_of(gap, place, b, i):
     return (first, second, share) if i == 0 else (second, first, share)
 
 
-@compiled
-def _room(row, rgba):
-    """Room for `_weigh_side`."""
-    layers, count = len(row), rgba.shape[1]
-    changes = np.empty((layers + 1, count)), np.empty((layers + 1, 2)), np.empty((layers + 1, 2), np.int32)
-    return np.empty(layers), np.empty((layers, count)), *changes
+@loop
+def weigh_sides(rgba, row, rows, gap, place, ends, ties, stack, change, moves, movers, cells, share):
+    """Fill in how composites change on both sides of breaks, S = 2 B, where samples move; see `stack_sides`.
+
+    A composite changes by `change` times the motion, along `moves`, of both `movers`, for each layer. The last of K + 1
+    rows is of the sample that ends there, as if the composite moved with it.
+
+    Args:
+        rgba: (N, C).
+        row: (K, H, W).
+        rows: (B, 2) of outlines.
+        gap: (B, 3).
+        place: (B,).
+        ends: (B, 2).
+        ties: (T, 2).
+        stack: (B, 2, K).
+        change: (S, K + 1, C) to fill.
+        moves: (S, K + 1, 2) to fill, x and y.
+        movers: (S, K + 1, 2) int32 to fill, samples or −1.
+        cells: (S, 2, 2) int32 to fill: y and x of the cell on the side, and of that beyond; −1 where nothing changes.
+        share: (S,) to fill, what the first cell has of the change.
+    """
+    normal, through, behind = np.empty((len(gap), 2)), np.empty(len(row)), np.empty((len(row), rgba.shape[1]))
+    _fill_normals(gap, place, ties, normal)
+    for s in range(len(cells)):
+        b, i, cells[s] = s // 2, s % 2, -1
+        if not (ends[b, i] and stack[b, i, 0] >= 0):
+            continue
+        here, beyond, share[s] = _cells_of(gap, place, b, i)
+        cells[s, 0, 0], cells[s, 0, 1] = here
+        cells[s, 1, 0], cells[s, 1, 1] = beyond
+        tables = change[s], moves[s], movers[s]
+        _weigh_side(b, i, rgba, row, here, gap, rows, stack, normal, through, behind, *tables)
 
 
 @loop
-def push_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_points, t_positions, out):
-    """Add to `out` (H, W, C) how composites change beside breaks as samples move, see `stack_sides`."""
-    normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
-    _fill_normals(gap, place, ties, normal)
-    for side in range(2 * len(gap)):
-        b, i = side // 2, side % 2
-        if not (ends[b, i] and stack[b, i, 0] >= 0):
-            continue
-        cell, beyond, share = _cells_of(gap, place, b, i)
-        _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
-        for k in range(len(row) + 1):
+def push_sides(change, moves, movers, cells, share, t_positions, out):
+    """Add to `out` (H, W, C) how composites change as samples move; arguments as of `weigh_sides`."""
+    for s in range(len(cells)):
+        (y, x), (down, right) = cells[s]
+        for k in range(len(change[s]) if y >= 0 else 0):
             motion = 0.0
-            for n in movers[k]:
+            for n in movers[s, k]:
                 if n >= 0:
-                    motion += moves[k, 0] * t_positions[n, 0] + moves[k, 1] * t_positions[n, 1]
-            for c in range(rgba.shape[1]):
-                out[cell[0], cell[1], c] += share * change[k, c] * motion
-                out[beyond[0], beyond[1], c] += (1 - share) * change[k, c] * motion
+                    motion += moves[s, k, 0] * t_positions[n, 0] + moves[s, k, 1] * t_positions[n, 1]
+            for c in range(out.shape[2]):
+                out[y, x, c] += share[s] * change[s, k, c] * motion
+                out[down, right, c] += (1 - share[s]) * change[s, k, c] * motion
 
 
 @loop
-def pull_sides(rgba, row, rows, gap, place, points, ends, ties, stack, stack_points, g, g_positions):
+def pull_sides(change, moves, movers, cells, share, g, g_positions):
     """Add to gradients of positions those of `push_sides`."""
-    normal, (through, behind, change, moves, movers) = np.empty((len(gap), 2)), _room(row, rgba)
-    _fill_normals(gap, place, ties, normal)
-    for side in range(2 * len(gap)):
-        b, i = side // 2, side % 2
-        if not (ends[b, i] and stack[b, i, 0] >= 0):
-            continue
-        cell, beyond, share = _cells_of(gap, place, b, i)
-        _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind, change, moves, movers)
-        for k in range(len(row) + 1):
+    for s in range(len(cells)):
+        (y, x), (down, right) = cells[s]
+        for k in range(len(change[s]) if y >= 0 else 0):
             total = 0.0
-            for c in range(rgba.shape[1]):
-                mixed = share * g[cell[0], cell[1], c] + (1 - share) * g[beyond[0], beyond[1], c]
-                total += change[k, c] * mixed
-            for n in movers[k]:
+            for c in range(g.shape[2]):
+                total += change[s, k, c] * (share[s] * g[y, x, c] + (1 - share[s]) * g[down, right, c])
+            for n in movers[s, k]:
                 if n >= 0:
-                    g_positions[n, 0] += moves[k, 0] * total
-                    g_positions[n, 1] += moves[k, 1] * total
+                    g_positions[n, 0] += moves[s, k, 0] * total
+                    g_positions[n, 1] += moves[s, k, 1] * total
