@@ -44,11 +44,13 @@ def taken(view: rts.View, number: int, defects: tuple[str, ...], rng: np.random.
         linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
         linear = np.clip(linear * (1 + rng.uniform(-EXPOSURE, EXPOSURE)), 0, 1)
         colors = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-    if "jpeg" in defects:
+    before = bool({"jpeg", "masks"} & set(defects))
+    if before:
         behind = scipy.ndimage.gaussian_filter(rng.random((256, 256, 3)), (6, 6, 0)) * 4 - 1.5
-        whole = np.clip(np.where(alpha[..., None] > 0.5, colors, behind), 0, 1)
+        colors = np.clip(alpha[..., None] * colors + (1 - alpha[..., None]) * behind, 0, 1)
+    if "jpeg" in defects:
         buffer = io.BytesIO()
-        Image.fromarray(np.uint8(255 * whole)).save(buffer, "JPEG", quality=70)
+        Image.fromarray(np.uint8(255 * colors)).save(buffer, "JPEG", quality=70)
         colors = np.asarray(Image.open(buffer), np.float32) / 255
     if "masks" in defects:
         way = [SHIFT * WIDTH * scipy.ndimage.gaussian_filter(rng.normal(size=(256, 256)), WIDTH) / 3 for _ in range(2)]
@@ -61,8 +63,11 @@ def taken(view: rts.View, number: int, defects: tuple[str, ...], rng: np.random.
     if "focal" in defects:
         scale = np.diag([1 + FOCAL, 1 + FOCAL, 1, 1])
         camera = camera.replace(projection=camera.projection @ scale, aspect=None)
+    name = f"{number}.png"
+    if before:
+        return rts.View(camera, colors.astype(np.float32), view.size, name=name, mask=alpha.astype(np.float32))
     picture = np.concatenate([colors * alpha[..., None], alpha[..., None]], axis=2).astype(np.float32)
-    return rts.View(camera, picture, view.size, name=f"{number}.png")
+    return rts.View(camera, picture, view.size, name=name)
 
 
 def onto(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -78,7 +83,8 @@ def run(defects: tuple[str, ...], fit: bool, folder: Path) -> None:
 
     known, rng = subject("spot"), np.random.default_rng(0)
     views = [taken(view, i, defects, rng) for i, view in enumerate(known.views)]
-    both = [(v.image[..., 3] > 0.5, k.image[..., 3] > 0.5) for v, k in zip(views, known.views, strict=True)]
+    alphas = [v.image[..., 3] if v.mask is None else v.mask for v in views]
+    both = [(alpha > 0.5, view.image[..., 3] > 0.5) for alpha, view in zip(alphas, known.views, strict=True)]
     overlap = np.mean([(a & b).sum() / (a | b).sum() for a, b in both])
     found = rts_reconstruct.reconstruct(
         views, folder, quick=True, texture=0, held_out=0, fit_cameras=fit, progress=False

@@ -8,7 +8,7 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
-`rts_compare`, `rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts_compare`, `rts.NarrowBand`, `rts.Ndc` and `rts.load_radiance_field`.
 """
 
 # pyright: reportUnsupportedDunderAll=false
@@ -77,6 +77,7 @@ _GONE = {
     "Sampled": "it is the type of what rts.sample returns",
     "Tuned": "it is the type of what rts.tune returns",
     "transforms": "rts.Camera.look_at, .perspective and .orthographic make cameras, rts.rigid the matrix of a pose",
+    "volume_render": "the result of rts.load_radiance_field has the method volume_render",
 }
 """Names of earlier versions that are no names of `rts` any more → what there is instead."""
 
@@ -84,7 +85,7 @@ _GONE = {
 def __getattr__(name: str):
     """The built-in surface or function of this name, imported through its entry point on first use."""
     if name in _GONE:
-        raise AttributeError(f"rts.{name} is gone since 0.2: {_GONE[name]}")
+        raise AttributeError(f"rts.{name} is gone: {_GONE[name]}")
     for place, names in _MOVED.items():
         if name in names.split():
             errors.warn_deprecated(f"rts.{name}", f"{place}.{name}", until="0.4")
@@ -147,6 +148,5 @@ __all__ = [
     "save_views",
     "show",
     "tune",
-    "volume_render",
     "warmup",
 ]

@@ -10,7 +10,7 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
-`rts_compare`, `rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts_compare`, `rts.NarrowBand`, `rts.Ndc` and `rts.load_radiance_field`.
 """
 
 import os
@@ -117,7 +117,6 @@ __all__ = [
     "save_views",
     "show",
     "tune",
-    "volume_render",
     "warmup",
 ]
 
@@ -506,8 +505,53 @@ class _Architecture(NamedTuple):
     layers: int
     parameters: int
 
+class _VolumeImage(NamedTuple):
+    image: np.ndarray
+    coarse: int
+    fine: int
+
 class _RadianceField:
     weights: Any
+
+    def volume_render(
+        self,
+        camera: Camera,
+        size: tuple[int, int],
+        *,
+        near: float | None = None,
+        far: float | None = None,
+        samples: tuple[int, int] = (64, 64),
+        background: Literal["white", "black"] | Sequence[float] | np.ndarray | None = "white",
+        ndc: Ndc | None = None,
+        progress: bool | None = None,
+    ) -> _VolumeImage:
+        """The image of the field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
+
+        The coarse network is evaluated at N_c equal steps of depth (of disparity with `ndc`). Its samples' weights are
+        a distribution along the ray, by whose inverse N_f more samples are placed. The fine network is evaluated at all
+        N_c + N_f samples (Mildenhall et al. 2020, §4 and 5). Surface light fields are compared with this image.
+        Computed by torch if installed, else by NumPy.
+
+        Args:
+            camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras
+                of `load_views` with `pixel_center`).
+            size: (height, width) in pixels.
+            near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near
+                plane.
+            far: depth at which rays end; default 6; with `ndc`, always infinity.
+            samples: (N_c, N_f), at least 3 and 1.
+            background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
+            ndc: the map from the world to the field's space; None if the field's space is the world.
+            progress: True to show a progress bar, None to do so in a terminal, False for none.
+
+        Returns:
+            A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding
+            of the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
+
+        Raises:
+            InputError: an argument is wrong, or the camera is orthographic.
+        """
+        ...
 
     def architecture(self, network: str = "fine") -> _Architecture:
         """The architecture of the network "coarse" or "fine"."""
@@ -549,11 +593,6 @@ class _RadianceField:
         """The weights of both networks, nested as `weights` is, as NumPy arrays without derivatives."""
         ...
 
-class _VolumeImage(NamedTuple):
-    image: np.ndarray
-    coarse: int
-    fine: int
-
 def load_radiance_field(path: str | os.PathLike[str]) -> _RadianceField:
     """The radiance field (Mildenhall et al. 2020) whose weights an .npz holds.
 
@@ -566,51 +605,11 @@ def load_radiance_field(path: str | os.PathLike[str]) -> _RadianceField:
 
     Returns:
         An object with `weights`, {"coarse": network, "fine": network} of float32 NumPy arrays; `architecture(network)`;
-        `lattice(bounds, shape)`, its density at points; and `save(path)`.
+        `lattice(bounds, shape)`, its density at points; `volume_render(camera, size)`; and `save(path)`.
 
     Raises:
         InputError: there is no such file, it is no .npz, holds pickles, or other than finite floating-point numbers; a
             layer is missing, unknown, or its shape does not fit.
-    """
-    ...
-
-def volume_render(
-    field: _RadianceField,
-    camera: Camera,
-    size: tuple[int, int],
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    samples: tuple[int, int] = (64, 64),
-    background: Literal["white", "black"] | Sequence[float] | np.ndarray | None = "white",
-    ndc: Ndc | None = None,
-    progress: bool | None = None,
-) -> _VolumeImage:
-    """The image of a radiance field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
-
-    The coarse network is evaluated at N_c equal steps of depth (of disparity with `ndc`). Its samples' weights are a
-    distribution along the ray, by whose inverse N_f more samples are placed. The fine network is evaluated at all
-    N_c + N_f samples (Mildenhall et al. 2020, §4 and 5). Surface light fields are compared with this image. Computed
-    by torch if installed, else by NumPy.
-
-    Args:
-        field: the result of `load_radiance_field`; its weights may be arrays of any engine.
-        camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras of
-            `load_views` with `pixel_center`).
-        size: (height, width) in pixels.
-        near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near plane.
-        far: depth at which rays end; default 6; with `ndc`, always infinity.
-        samples: (N_c, N_f), at least 3 and 1.
-        background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
-        ndc: the map from the world to the field's space; None if the field's space is the world.
-        progress: True to show a progress bar, None to do so in a terminal, False for none.
-
-    Returns:
-        A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding of
-        the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
-
-    Raises:
-        InputError: an argument is wrong, or the camera is orthographic.
     """
     ...
 

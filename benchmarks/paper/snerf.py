@@ -294,7 +294,7 @@ def baseline(scene: Scene, shots: Sequence[Shot], folder: Path, side: str) -> tu
         path = folder / f"volume-{side}-{shot.name}.npz"
         if not path.is_file():
             begun = time.perf_counter()
-            found = rts.volume_render(scene.field, shot.camera, shot.size, background=scene.background, ndc=scene.ndc)
+            found = scene.field.volume_render(shot.camera, shot.size, background=scene.background, ndc=scene.ndc)
             seconds = time.perf_counter() - begun
             np.savez(path, images=found.image, seconds=seconds, coarse=found.coarse, fine=found.fine)
         with np.load(path) as file:
@@ -404,7 +404,7 @@ def timed(scene: Scene, values: np.ndarray, weights: Any, frames: int = 5) -> di
             _image(part, scene, shot.camera, shot.size)
             surface.append(time.perf_counter() - begun)
         begun = time.perf_counter()
-        rts.volume_render(scene.field, shot.camera, shot.size, background=scene.background, ndc=scene.ndc)
+        scene.field.volume_render(shot.camera, shot.size, background=scene.background, ndc=scene.ndc)
         volume.append(time.perf_counter() - begun)
     return {"side": side, "volume": volume, "surface": surface}
 

@@ -108,5 +108,5 @@ Image.open("radiance_field.png").copy()
 # image = rts.render(rts.Part(surface, theta, rts.plugin("shaders", "radiance")()), camera, (400, 400))
 # ```
 #
-# `rts.volume_render` draws the field as a volume, to compare with. `benchmarks/paper/snerf.py` refines lattice and
-# network together ([measured](../results/radiance-field.md)).
+# `field.volume_render` draws it as a volume, to compare with.
+# `benchmarks/paper/snerf.py` refines lattice and network together ([measured](../results/radiance-field.md)).

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from rts import InputError, engine_of
+from rts import Camera, InputError, engine_of
 from rts.plugin_api.arrays import Tree, map_leaves
 from rts.plugin_api.checks import quoted
 from rts_surfaces.radiance_field.lattice import lattice
+from rts_surfaces.radiance_field.ndc import Ndc
 from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_network, placed
+from rts_surfaces.radiance_field.volume import VolumeImage, volume_image
 
 NETWORKS = ("coarse", "fine")
 LARGEST = 2**30
@@ -87,6 +90,56 @@ class RadianceField:
         """
         return lattice(self, bounds, shape, network=network, keep=keep, progress=progress)
 
+    def volume_render(
+        self,
+        camera: Camera,
+        size: tuple[int, int],
+        *,
+        near: float | None = None,
+        far: float | None = None,
+        samples: tuple[int, int] = (64, 64),
+        background: Literal["white", "black"] | Sequence[float] | np.ndarray | None = "white",
+        ndc: Ndc | None = None,
+        progress: bool | None = None,
+    ) -> VolumeImage:
+        """The image of the field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
+
+        The coarse network is evaluated at N_c equal steps of depth (of disparity with `ndc`). Its samples' weights are
+        a distribution along the ray, by whose inverse N_f more samples are placed. The fine network is evaluated at all
+        N_c + N_f samples (Mildenhall et al. 2020, §4 and 5). Surface light fields are compared with this image.
+        Computed by torch if installed, else by NumPy.
+
+        Args:
+            camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras
+                of `load_views` with `pixel_center`).
+            size: (height, width) in pixels.
+            near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near
+                plane.
+            far: depth at which rays end; default 6; with `ndc`, always infinity.
+            samples: (N_c, N_f), at least 3 and 1.
+            background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
+            ndc: the map from the world to the field's space; None if the field's space is the world.
+            progress: True to show a progress bar, None to do so in a terminal, False for none.
+
+        Returns:
+            A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding
+            of the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
+
+        Raises:
+            InputError: an argument is wrong, or the camera is orthographic.
+        """
+        return volume_image(
+            self,
+            camera,
+            size,
+            near=near,
+            far=far,
+            samples=samples,
+            background=background,
+            ndc=ndc,
+            progress=progress,
+        )
+
     def on_host(self) -> Tree:
         """The weights of both networks, nested as `weights` is, as NumPy arrays without derivatives."""
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
@@ -104,7 +157,7 @@ def load_radiance_field(path: str | os.PathLike[str]) -> RadianceField:
 
     Returns:
         An object with `weights`, {"coarse": network, "fine": network} of float32 NumPy arrays; `architecture(network)`;
-        `lattice(bounds, shape)`, its density at points; and `save(path)`.
+        `lattice(bounds, shape)`, its density at points; `volume_render(camera, size)`; and `save(path)`.
 
     Raises:
         InputError: there is no such file, it is no .npz, holds pickles, or other than finite floating-point numbers; a

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from rts import Camera, InputError, engine_of
 from rts.plugin_api.arrays import constants, map_leaves
 from rts.plugin_api.checks import check_numbers, is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, in_chunks, progress_bar
-from rts_surfaces.radiance_field.field import RadianceField
 from rts_surfaces.radiance_field.ndc import Ndc, checked_size
 from rts_surfaces.radiance_field.network import density_and_radiance
 
@@ -37,49 +36,22 @@ class VolumeImage(NamedTuple):
     fine: int
 
 
-def volume_render(
-    field: RadianceField,
+def volume_image(
+    field: Any,
     camera: Camera,
     size: tuple[int, int],
     *,
-    near: float | None = None,
-    far: float | None = None,
-    samples: tuple[int, int] = (64, 64),
-    background: Literal["white", "black"] | Sequence[float] | np.ndarray | None = "white",
-    ndc: Ndc | None = None,
-    progress: bool | None = None,
+    near: float | None,
+    far: float | None,
+    samples: tuple[int, int],
+    background: Any,
+    ndc: Ndc | None,
+    progress: bool | None,
 ) -> VolumeImage:
-    """The image of a radiance field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
-
-    The coarse network is evaluated at N_c equal steps of depth (of disparity with `ndc`). Its samples' weights are a
-    distribution along the ray, by whose inverse N_f more samples are placed. The fine network is evaluated at all
-    N_c + N_f samples (Mildenhall et al. 2020, §4 and 5). Surface light fields are compared with this image. Computed
-    by torch if installed, else by NumPy.
-
-    Args:
-        field: the result of `load_radiance_field`; its weights may be arrays of any engine.
-        camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras of
-            `load_views` with `pixel_center`).
-        size: (height, width) in pixels.
-        near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near plane.
-        far: depth at which rays end; default 6; with `ndc`, always infinity.
-        samples: (N_c, N_f), at least 3 and 1.
-        background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
-        ndc: the map from the world to the field's space; None if the field's space is the world.
-        progress: True to show a progress bar, None to do so in a terminal, False for none.
-
-    Returns:
-        A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding of
-        the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
-
-    Raises:
-        InputError: an argument is wrong, or the camera is orthographic.
-    """
+    """See `RadianceField.volume_render`."""
     height, width = checked_size(size)
     near, far = _planes(near, far, ndc)
     color = None if background is None else _color(background)
-    if not isinstance(field, RadianceField):
-        raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
     if not isinstance(camera, Camera):
         raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
     if camera.is_stacked:
@@ -148,7 +120,7 @@ def _color(background: Any) -> np.ndarray:
     return color.astype(np.float32)
 
 
-def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
+def _evaluator(field: Any, name: str) -> Callable[..., np.ndarray]:
     """A function that evaluates the network "coarse" or "fine" at S points along each of R rays.
 
     It takes origins, directions, and unit directions in the world (R, 3) each, and t (R, S): points are

@@ -220,9 +220,9 @@ def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(instal
 
 
 def test_names_of_earlier_versions_tell_what_there_is_instead():
-    with pytest.raises(AttributeError, match="^rts.transforms is gone since 0.2: rts.Camera.look_at, .perspective"):
+    with pytest.raises(AttributeError, match="^rts.transforms is gone: rts.Camera.look_at, .perspective"):
         rts.transforms  # noqa: B018
-    with pytest.raises(ImportError, match="^rts.transforms is gone since 0.2: rts.Camera.look_at, .perspective"):
+    with pytest.raises(ImportError, match="^rts.transforms is gone: rts.Camera.look_at, .perspective"):
         importlib.import_module("rts.transforms")
     for name, instead in rts._GONE.items():
         assert not hasattr(rts, name)

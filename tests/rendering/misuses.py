@@ -126,7 +126,7 @@ def broken(**options):
 
 
 def volume(**options):
-    return rts.volume_render(**{"field": FIELD, "camera": CAMERA, "size": SIZE, "samples": (3, 1), **options})
+    return FIELD.volume_render(**{"camera": CAMERA, "size": SIZE, "samples": (3, 1), **options})
 
 
 def energy(kind, **options):
@@ -282,7 +282,7 @@ GROUPS = {
         *("scene", "parameters", "tolerance", "budget_s", "directions", "size", "modes", "engine", "samplers"),
         *("splatters", "truths", "truth_samples"),
     ),
-    "volume_render": open_in(volume, "field", "camera", "size", "near", "far", "samples", "background", "ndc"),
+    "volume_render": open_in(volume, "camera", "size", "near", "far", "samples", "background", "ndc"),
     "warmup": {"processes": rts.warmup},
     "ARAP": open_in(lambda **o: energy(regularizers.ARAP, **o), "vertices", "faces", "weights"),
     "EdgeLength": open_in(lambda **o: energy(regularizers.EdgeLength, **o), "vertices", "faces", "target"),

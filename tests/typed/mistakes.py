@@ -17,7 +17,7 @@ rts.render(part, camera, size, supersample="adaptive")  # pyright: ignore[report
 rts.render(part, camera, size, sampler=3)  # pyright: ignore[reportArgumentType]
 rts.render(part, camera, size, splatter=rts.Sampler)  # pyright: ignore[reportArgumentType]
 rts.tune(3)  # pyright: ignore[reportArgumentType]
-rts.volume_render("field.npz", camera, size)  # pyright: ignore[reportArgumentType]
+rts.load_radiance_field("field.npz").volume_render(camera, 128)  # pyright: ignore[reportArgumentType]
 
 # No mistakes: arrays of any kind, and plugins of others.
 rts.Mesh(torch.tensor([[0, 1, 2]]), {"weights": None, "uv": np.array([[0, 1, 2]])})

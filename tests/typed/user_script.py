@@ -49,7 +49,7 @@ def pose_of(target: np.ndarray, part: rts.Part, start: np.ndarray) -> tuple[np.n
 def field(path: str) -> np.ndarray:
     loaded = rts.load_radiance_field(path)
     camera = rts.Camera.look_at((0, 0, 4), (0, 0, 0))
-    drawn = rts.volume_render(loaded, camera, SIZE, background="white", ndc=rts.Ndc.of_images(SIZE, 100.0))
+    drawn = loaded.volume_render(camera, SIZE, background="white", ndc=rts.Ndc.of_images(SIZE, 100.0))
     return drawn.image + loaded.lattice(((-1, -1, -1), (1, 1, 1)), (8, 8, 8)).max()
 
 

@@ -42,10 +42,10 @@ def told(views: list[rts.View], named: str, ignored: bool) -> list[rts.View] | N
     if all(image.shape[2] == 4 for image in images):
         clear = np.mean([((i[..., 3] < 0.5) & (m > 0.5)).mean() for i, m in zip(images, masks, strict=True)])
         found = views if clear > OUTSIDE else None
-    shown = [_shown(view) for view in looked_at]
-    outside = np.mean([((mask < 0.5) & (s > 0.5)).mean() for mask, s in zip(masks, shown, strict=True)])
+    lit = [shown(view) for view in looked_at]
+    outside = np.mean([((mask < 0.5) & (s > 0.5)).mean() for mask, s in zip(masks, lit, strict=True)])
     if found is None and not ignored and outside > OUTSIDE:
-        found = [_with(view, _cut_out, None if view.lens is None else _shown) for view in views]
+        found = [_with(view, _cut_out, None if view.lens is None else shown) for view in views]
     if found is not None:
         _check_shown(found, named)
         _check_polarity(found, named)
@@ -87,7 +87,7 @@ def _mask(view: rts.View) -> np.ndarray:
     return np.ones(view.size, np.float32) if view.mask is None else view.mask
 
 
-def _shown(view: rts.View) -> np.ndarray:
+def shown(view: rts.View) -> np.ndarray:
     """1 at pixels (H, W) that the view's lens leaves a picture, but for its border; 0 elsewhere.
 
     Masks of data sets are 0 elsewhere, whether they tell the object or not.

@@ -12,6 +12,7 @@ import trimesh
 from PIL import Image
 
 import rts
+from rts_reconstruct.masks import shown
 from rts_reconstruct.solid import CELL
 from rts_reconstruct.world import World
 
@@ -51,30 +52,45 @@ def _silhouette(solid: trimesh.Trimesh, camera: rts.Camera, size: tuple[int, int
     }
     part = rts.Part(rts.Mesh(np.asarray(solid.faces, np.int32)), theta, "unlit")
     alpha = np.asarray(rts.render(part, camera, size, splatter="none"))[..., 3]
-    shown = alpha > 0.5
-    if shown.all() or not shown.any():
+    solid_seen = alpha > 0.5
+    if solid_seen.all() or not solid_seen.any():
         return alpha, np.ones(size, np.float32)
     depth = max(float(np.asarray(camera.depth(np.zeros((1, 3))))[0]), CELL)
     band = max(1.0, CELL * camera.projection[1, 1] * size[0] / (2 * depth))
-    inside, outside = (np.asarray(scipy.ndimage.distance_transform_edt(kind)) for kind in (shown, ~shown))
-    away = np.where(shown, inside, outside)
+    inside, outside = (np.asarray(scipy.ndimage.distance_transform_edt(kind)) for kind in (solid_seen, ~solid_seen))
+    away = np.where(solid_seen, inside, outside)
     return alpha, (away > band).astype(np.float32)
 
 
 def write_masks(folder: Path, views: Sequence[rts.View], solid: trimesh.Trimesh, world: World) -> None:
     """Write NAME.png for each view of a data set: white for the object, black behind it, grey where it is not known."""
-    folder.mkdir(parents=True, exist_ok=True)
     for number, view in enumerate(views):
         height, width = view.size
         shrink = max(1.0, max(view.size) / LARGEST)
         size = (max(1, round(height / shrink)), max(1, round(width / shrink)))
         alpha, counts = _silhouette(solid, world.camera(view.camera), size)
+        if view.mask is not None:
+            counts = counts * (np.asarray(Image.fromarray(view.mask).resize(size[::-1], Image.Resampling.BOX)) > 0.5)
         levels = np.where(counts < 0.5, GREY, np.where(alpha > 0.5, WHITE, BLACK)).astype(np.uint8)
-        Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST).save(folder / _file(view, number))
+        _write(folder, view, number, levels)
+
+
+def write_alphas(folder: Path, views: Sequence[rts.View]) -> None:
+    """Write NAME.png for each view of a data set: white where its alpha tells the object, black elsewhere."""
+    for number, view in enumerate(views):
+        _write(folder, view, number, np.where(view.image[..., 3] > 0.5, WHITE, BLACK).astype(np.uint8))
+
+
+def _write(folder: Path, view: rts.View, number: int, levels: np.ndarray) -> None:
+    """Write the mask of a view in the size of its picture, from levels in another."""
+    folder.mkdir(parents=True, exist_ok=True)
+    height, width = view.size
+    mask = Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST)
+    mask.save(folder / _file(view, number))
 
 
 def mended(views: Sequence[rts.View], folder: Path) -> list[rts.View]:
-    """Views of a data set with alpha by masks as `write_masks` writes them.
+    """Views of a data set with alpha by masks as `write_masks` writes them, in place of their own.
 
     Raises:
         InputError: masks are missing, of another size, or cannot be read.
@@ -110,7 +126,7 @@ def _masked(view: rts.View, file: Path) -> rts.View:
     def mask() -> np.ndarray:
         level = levels()
         counts = ((level < GREY / 2) | (level > (GREY + WHITE) / 2)).astype(np.float32)
-        return counts if view.mask is None else counts * view.mask
+        return counts if view.lens is None else counts * shown(view)
 
     return rts.View(view.camera, image, view.size, name=view.name, mask=mask, path=view.path, lens=view.lens)
 

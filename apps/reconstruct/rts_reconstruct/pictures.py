@@ -17,6 +17,7 @@ from rts_reconstruct import masks as masks_of
 from rts_reconstruct import outlining
 from rts_reconstruct import points as seen_points
 from rts_reconstruct.points import Points
+from rts_reconstruct.refining import refined
 from rts_reconstruct.solid import solid_of
 from rts_reconstruct.world import World, around
 
@@ -66,6 +67,7 @@ def read(
     masks: str | Path = "object",
     region: Any = None,
     start: Any = None,
+    refine: bool = False,
 ) -> Pictures:
     """The pictures of a data set.
 
@@ -81,6 +83,7 @@ def read(
         region: center and radius (4,) of a ball that the object is in, world of the data set; None for that of the
             points.
         start: the kind of start, of which "points" needs the solid.
+        refine: True to refine masks by the pictures' colours first; see `refining.can_refine`. It needs OpenCV.
 
     Raises:
         InputError: no views, one view, pictures that do not tell the object, or half of them without it, or an argument
@@ -97,6 +100,8 @@ def read(
             f"{len(views)} view{'s'[: len(views) != 1]} in {_named(path)}, and {one} left to fit; expected at least "
             "two, and thirty around a thing for all of its surface"
         )
+    if refine:
+        views = [refined(view, None if view.lens is None else masks_of.shown(view)) for view in views]
     given, named = views, _named(path)
     points = seen_points.read(path)
     ball = None if points is None else _region(points, given, region)

@@ -11,7 +11,7 @@ import numpy as np
 
 import rts
 from rts.diagnostics.measuring_api import output_folder, writing
-from rts_reconstruct import files, job, outlining, picture_files, pictures, stages
+from rts_reconstruct import files, job, outlining, picture_files, pictures, refining, stages
 from rts_reconstruct.arguments import check_counts, check_other_folder, checked_masks, checked_region
 from rts_reconstruct.cameras import with_cameras
 from rts_reconstruct.contradictions import INEXACT, consistency, contradictions
@@ -127,11 +127,17 @@ def reconstruct(
         pictures.read, views, held_out=held_out, background=background, masks=masks, region=region, start=start
     )
     shots = read(size=size)
+    consistent = given = job.shared(lambda: consistency(shots))
+    if given < INEXACT and refining.can_refine(shots.given) and refining.is_installed():
+        finer = functools.partial(read, refine=True)
+        refined = finer(size=size)
+        found = job.shared(lambda: consistency(refined))
+        if found > given:
+            read, shots, consistent = finer, refined, found
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
-    consistent = job.shared(lambda: consistency(shots))
     settings = stages.Settings(batch, seed, fit_cameras, surface, progress, robust=consistent < INEXACT)
     near = mesh is shots.solid  # Which the first stage's few faces would make coarser.
     plan = [
@@ -144,8 +150,10 @@ def reconstruct(
             files.forget_unfinished(folder)
             if shots.by_points and shots.solid is not None:
                 outlining.write_masks(folder / "masks", shots.given, shots.solid, shots.world)
+            elif consistent > given:
+                outlining.write_alphas(folder / "masks", shots.given)
     if first:
-        for note in _notes(shots, folder, consistent):
+        for note in _notes(shots, folder, given, consistent):
             print(f"rts: {note}", file=sys.stderr)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
     identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
@@ -164,19 +172,28 @@ def reconstruct(
     return run.finish(light, trim)
 
 
-def _notes(shots: pictures.Pictures, folder: Path, consistent: float) -> list[str]:
+def _notes(shots: pictures.Pictures, folder: Path, given: float, consistent: float) -> list[str]:
     """Lines on what the points and masks tell, before the fit."""
     notes = [*picture_files.turned(shots.given), *picture_files.repeated(shots.given), *contradictions(shots)]
+    seen = folder / "masks"
+    if consistent > given:
+        notes.append(
+            f"outlines of masks were moved to edges of the pictures, which makes masks overlap with pictures of what "
+            f"they have in common by {consistent:.2f} in the median, not {given:.2f}; look at {seen}, and mend them "
+            f"with --masks {seen}"
+        )
     if consistent < INEXACT:
+        lacking = refining.can_refine(shots.given) and not refining.is_installed()
         notes.append(
             f"masks overlap with pictures of what they have in common by {consistent:.2f} in the median, where right "
             "ones do by some 0.9: they are inexact, or cameras are off, for which there is --fit-cameras; large "
             "differences count less in the fit"
+            + ("; with OpenCV (the extra photos) masks are refined by the pictures" if lacking else "")
         )
     if shots.by_points and shots.region is not None:
         ball = ",".join(f"{x:.4g}" for x in (*shots.region.center, shots.region.unit))
         notes.append(
-            f"the pictures have neither alpha nor masks: COLMAP's points tell the object; look at {folder / 'masks'}, "
-            f"and mend them with --masks {folder / 'masks'}, or the region with --region={ball} (x,y,z,radius)"
+            f"the pictures have neither alpha nor masks: COLMAP's points tell the object; look at {seen}, "
+            f"and mend them with --masks {seen}, or the region with --region={ball} (x,y,z,radius)"
         )
     return notes

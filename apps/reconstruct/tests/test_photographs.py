@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import rts_reconstruct
 import trimesh
 from PIL import Image
 from rts_reconstruct import (
@@ -15,6 +16,7 @@ from rts_reconstruct import (
     pictures,
     points,
     posing,
+    refining,
     sight,
     solid,
     texturing,
@@ -172,6 +174,79 @@ def test_masks_of_colmap_only_say_which_pixels_count():
     found = pictures.read(masked(()), SIZE, 0, np.ones(3), masks="ignore")
     assert not found.outlined
     np.testing.assert_allclose(found.views[0].mask, images()[0][..., 3], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def misplaced():
+    """Photographs of the ellipsoid before something green, their masks off by four pixels, and the right alpha."""
+    size = (96, 96)
+    y, x = np.mgrid[:96, :96] / 96
+    behind = np.stack([0.2 * x, 0.5 + 0.4 * y, 0.3 * (1 - x)], axis=-1).astype(np.float32)
+    found, truth = [], []
+    for i, camera in enumerate(cameras()):
+        image = np.asarray(rts.render(ellipsoid(), camera, size, background=behind)).clip(0, 1)
+        alpha = np.asarray(rts.render(ellipsoid(), camera, size))[..., 3]
+        mask = np.roll(alpha, 4 * (-1) ** i, axis=i // 2 % 2)
+        found.append(rts.View(camera, image[..., :3], name=f"{i}.png", mask=mask))
+        truth.append(alpha > 0.5)
+    return found, truth
+
+
+def test_masks_are_refined_to_the_edges_of_the_pictures(misplaced):
+    views, truth = misplaced
+    assert refining.can_refine(views)
+    refined = [refining.refined(view, None).image for view in views]
+    for image, view, right in zip(refined, views, truth, strict=True):
+        alpha = image[..., 3] > 0.5
+        assert (alpha & right).sum() / (alpha | right).sum() > 0.97
+        rough = view.mask > 0.5
+        assert (rough & right).sum() / (rough | right).sum() < 0.87
+        np.testing.assert_array_equal(image[..., :3], view.image * alpha[..., None])
+    again = [refining.refined(view, None).image for view in views]
+    np.testing.assert_array_equal(refined, again)
+    before, after = (contradictions.consistency(pictures.read(views, 96, 0, refine=refine)) for refine in (False, True))
+    assert before < contradictions.INEXACT < after
+
+
+def test_masks_are_refined_in_few_pixels_and_made_as_large_as_their_pictures(misplaced, monkeypatch):
+    views, truth = misplaced
+    monkeypatch.setattr(refining, "LARGEST", 48)
+    alpha = refining.refined(views[0], None).image[..., 3] > 0.5
+    assert (alpha & truth[0]).sum() / (alpha | truth[0]).sum() > 0.93
+
+
+def test_masks_without_a_side_stay_as_they_are(misplaced):
+    view = misplaced[0][0]
+    for mask in (np.ones(view.size), np.zeros(view.size)):
+        white = rts.View(view.camera, view.image, mask=mask.astype(np.float32))
+        np.testing.assert_array_equal(refining.refined(white, None).image[..., 3], mask)
+
+
+def test_pictures_with_alpha_have_no_masks_to_refine(misplaced):
+    assert not refining.can_refine(views())
+    assert not refining.can_refine([rts.View(view.camera, view.image) for view in misplaced[0]])
+
+
+def test_a_reconstruction_refines_masks_and_writes_them_to_be_looked_at(misplaced, tmp_path, capsys):
+    views, truth = misplaced
+    quick = {"steps": 3, "size": 48, "texture": 0, "held_out": 0, "progress": False}
+    rts_reconstruct.reconstruct(views, tmp_path / "out", **quick)
+    assert "outlines of masks were moved to edges of the pictures" in capsys.readouterr().err
+    with Image.open(tmp_path / "out" / "masks" / "0.png.png") as mask:
+        white = np.asarray(mask) > 128
+    assert (white & truth[0]).sum() / (white | truth[0]).sum() > 0.97
+    mended = pictures.read(views, 96, 0, masks=tmp_path / "out" / "masks")
+    np.testing.assert_array_equal(mended.views[0].image[..., 3] > 0.5, white)
+    assert mended.views[0].mask.min() == 1  # Their own masks are not used.
+
+
+def test_without_opencv_inexact_masks_stay_and_the_extra_is_named(misplaced, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(refining, "is_installed", lambda: False)
+    quick = {"steps": 3, "size": 48, "texture": 0, "held_out": 0, "progress": False}
+    rts_reconstruct.reconstruct(misplaced[0], tmp_path / "out", **quick)
+    said = capsys.readouterr().err
+    assert "OpenCV (the extra photos)" in said and "large differences count less" in said
+    assert not (tmp_path / "out" / "masks").exists()
 
 
 # ------------------------------------------------------------------------------------------------ verdict, texture
