@@ -90,18 +90,18 @@ def _picture(
     opaque, context = all(scene.opaque), scene.context
     if opaque and sampled.depth is not None and not context.engine.differentiates:
         depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
+        number = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
         # Nothing moves, so that one sample stands for all.
         samples = context.engine.constant(np.zeros((1, 3)), depth)
-        return picture_of(depth, samples, namespace(row).clip(row, None, 0), place, size, opaque)
+        return picture_of(depth.reshape(-1), samples, np.where(row >= 0, number, -1), place, size, opaque)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
     positions, row, engine = splats.positions, splats.row, engine_of(splats.positions)
     place = constants(scene.camera, engine, positions)
     if not positions.shape[0]:
         positions = constants(np.zeros((1, 3)), engine, positions)
     xp = namespace(positions)
-    depth = xp.reshape(xp.take(stopped(positions)[:, 2], xp.reshape(xp.clip(row, 0, None), (-1,))), tuple(row.shape))
     samples = positions if opaque else xp.concat([positions[:, :2], splats.rgba[:, -1:]], axis=1)
-    return picture_of(depth, samples, row, place, size, opaque)
+    return picture_of(stopped(positions)[:, 2], samples, row, place, size, opaque)
 
 
 def _without_shadow(part: Part) -> Part:

@@ -14,6 +14,7 @@ from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.combine import combine
 from rts.operations.depth_limits import BIAS, FAR, OWN, REACH
+from rts.operations.depth_planes import even_depth
 from rts.operations.operation import Operation
 
 
@@ -32,7 +33,7 @@ def coverage(samples: Array, points: Array, row: Array, planes: Array, lens: Arr
         row: (H, W) the sample in each cell, or −1.
         planes: (9, H, W) of the sample in each cell, see `depth_planes`; the picture is `REACH` cells smaller on every
             side. Depths in it are `even_depth`.
-        lens: (4,): a and b, of clip w a + b · depth; the depth that even depths count from; that of the near plane.
+        lens: (5,), see `depth_planes`.
         opaque: whether samples let no light through.
     """
     return COVERAGE(samples, points, row, planes, lens, opaque=opaque)
@@ -42,11 +43,6 @@ def is_inside(points: Array, size: tuple[int, int], lens: Array) -> Array:
     """True for points (N, 3) in a picture (height, width), behind its near plane; see `coverage`."""
     x, y, depth = (points[:, i] for i in range(3))
     return (x >= 0) & (x <= size[1]) & (y >= 0) & (y <= size[0]) & (depth >= lens[3])
-
-
-def even_depth(depth: Array, lens: Array) -> Array:
-    """A depth that grows evenly with x and y on planes: linear depth itself if orthographic, else as −1 / depth."""
-    return (depth - lens[2]) / (lens[0] + lens[1] * depth)
 
 
 def cubic(d: Array) -> Array:

@@ -81,7 +81,7 @@ def _check(samples: np.ndarray, points: np.ndarray, row: np.ndarray, planes: np.
     """Refuse arrays of other shapes."""
     channels, height, width = planes.shape
     fits = row.shape == (height, width) and samples.shape[1] == 3 and points.shape[1] == 3 and len(samples) > 0
-    if not fits or channels != 9 or min(height, width) <= 2 * REACH or len(lens) != 4 or row.max() >= len(samples):
+    if not fits or channels != 9 or min(height, width) <= 2 * REACH or len(lens) != 5 or row.max() >= len(samples):
         shapes = ", ".join(str(x.shape) for x in (samples, points, row, planes, lens))
         raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
 

@@ -4,28 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.depth_limits import FAR, FLAT, NEARER, RIM
 from rts.operations.operation import Operation
 
 
-def depth_planes(even: Array, unit: Array) -> Array:
-    """The surface in each cell, (9, H, W): `even`, `unit`, slopes along x and y, how far four sides lie away, a limit.
+def depth_planes(depth: Array, row: Array, lens: Array) -> Array:
+    """The surface in each cell, (9, H, W): even depth, its unit, slopes along x and y, sides' distances, a limit.
 
-    Sides are the left, right, upper and lower one, in cells from the centre; by them motions are extrapolated from
+    The unit is the even depth of a cell's width; 0 where a cell has no sample. Sides are the left, right, upper and lower one, in cells from the centre; by them motions are extrapolated from
     within. On a smooth rim motions change with the root of the distance from the outline, as depths
     do. Where a point's even depth is at most the limit, plus the slopes times the point's x and y, the surface's plane
     is not in front of it. The result has no derivative.
 
     Args:
-        even: (H, W) depth, of a kind that grows evenly on planes.
-        unit: (H, W) the depth of a cell's width; 0 where a cell has no sample.
+        depth: (N,) linear depth of samples, N > 0.
+        row: (H, W) the sample in each cell, or −1.
+        lens: (5,): a and b, of clip w a + b · depth; the depth that even depths count from; that of the near plane; the
+            even depth of a cell's width, times clip w.
     """
-    return PLANES(even, unit)
+    return PLANES(depth, row, lens)
 
 
-def _specification(even: Array, unit: Array) -> Array:
+def even_depth(depth: Array, lens: Array) -> Array:
+    """A depth that grows evenly with x and y on planes: linear depth itself if orthographic, else as −1 / depth."""
+    return (depth - lens[2]) / (lens[0] + lens[1] * depth)
+
+
+def _specification(depth: Array, row: Array, lens: Array) -> Array:
+    xp, there, (height, width) = namespace(depth), row >= 0, row.shape
+    z = xp.take(stopped(depth), xp.reshape(xp.clip(row, 0, None), (-1,)))
+    z = xp.where(there, xp.reshape(z, (height, width)), lens[2])
+    return _planes(even_depth(z, lens), xp.where(there, lens[4] / (lens[0] + lens[1] * z), 0.0))
+
+
+def _planes(even: Array, unit: Array) -> Array:
+    """The planes of cells of which even depths and their units are known."""
     sides, slopes = [], []
     for axis in (1, 0):
         rise = _Rise(even, unit, axis)
@@ -77,8 +92,8 @@ class _Rise:
         return xp.where(joined, xp.where(rim, at_rim, FLAT), 0.0)
 
 
-def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, ...]:
-    return 9, *even
+def _shape(depth: tuple[int, ...], row: tuple[int, ...], lens: tuple[int, ...]) -> tuple[int, ...]:
+    return 9, *row
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:
@@ -87,5 +102,5 @@ def _loops() -> tuple[Callable, Callable, Callable]:
     return loops.forward, loops.push, loops.pull
 
 
-PLANES = Operation.of_loops("rts.depth_planes", _specification, (2, 2), _shape, _loops, differentiable=2)
+PLANES = Operation.of_loops("rts.depth_planes", _specification, (1, 2, 1), _shape, _loops)
 """The operation of `depth_planes`."""

@@ -6,23 +6,27 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
+from rts.errors import InputError
 from rts.operations.depth_limits import FAR, FLAT, NEARER, RIM
 
 WORK = 30
 """Nanoseconds for a cell, roughly."""
 
 
-def forward(even: np.ndarray, unit: np.ndarray, out: np.ndarray) -> None:
+def forward(depth: np.ndarray, row: np.ndarray, lens: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (9, H, W)."""
-    parallel(_forward, len(even), even, unit, out, work=WORK * even.size)
+    if not len(depth) or row.max() >= len(depth) or len(lens) != 5:
+        raise InputError(f"a picture has {len(depth)} samples and a lens {lens.shape}; expected some, and (5,)")
+    parallel(_even, len(row), depth, row, lens, out, work=2 * row.size)
+    parallel(_forward, len(row), out, work=WORK * row.size)
 
 
-def push(even: np.ndarray, unit: np.ndarray, t_even: object, t_unit: object, out: np.ndarray) -> None:
+def push(depth: np.ndarray, row: np.ndarray, lens: np.ndarray, t: object, out: np.ndarray) -> None:
     """Fill `out` with zeros."""
     out[...] = 0
 
 
-def pull(even: np.ndarray, unit: np.ndarray, g: np.ndarray, g_even: object, g_unit: object) -> None:
+def pull(depth: np.ndarray, row: np.ndarray, lens: np.ndarray, g: np.ndarray, g_depth: object) -> None:
     """Add no gradient."""
 
 
@@ -50,14 +54,27 @@ def _beyond(first, second, known, unit):
 
 
 @loop
-def _forward(start, stop, even, unit, out):
+def _even(start, stop, depth, row, lens, out):
+    """Fill even depths and their units, the first two channels of `out`."""
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            out[0, y, x], out[1, y, x] = 0, 0
+            if row[y, x] >= 0:
+                z = depth[row[y, x]]
+                over = lens[0] + lens[1] * z
+                out[0, y, x], out[1, y, x] = (z - lens[2]) / over, lens[4] / over
+
+
+@loop
+def _forward(start, stop, out):
+    """Fill the other channels."""
+    even, unit = out[0], out[1]
     height, width = even.shape
     # The picture is continued as if it were repeated.
     columns, rows = np.arange(-2, width + 2) % width, np.arange(-2, height + 2) % height
     for y in range(start, stop):
         for x in range(width):
             z, u = even[y, x], unit[y, x]
-            out[0, y, x], out[1, y, x] = z, u
             for axis in range(2):
                 # The cells from two behind to two ahead.
                 if axis == 0:

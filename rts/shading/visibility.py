@@ -16,9 +16,13 @@ from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
 from rts.contracts.checks import is_real
 from rts.errors import InputError
-from rts.operations.coverage import coverage, even_depth, is_inside
+from rts.operations.coverage import coverage, is_inside
 from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
+
+
+SOME = 1000
+"""Samples of whose depths the mean is taken, about."""
 
 
 @record(static=("size", "opaque"))
@@ -30,7 +34,7 @@ class Picture:
         samples: (M, 3), see `rts.operations.coverage`. Differentiable.
         row: (K, H, W), likewise, of K layers.
         planes: (K, 9, H, W), likewise.
-        lens: (4,), likewise.
+        lens: (5,), likewise.
         size: (height, width) of the picture.
         opaque: whether the samples let no light through.
     """
@@ -109,33 +113,25 @@ def picture_of(
     """The picture of samples in their cells.
 
     Args:
-        depth: (K, H, W) linear depth, without derivative; anything where a cell has no sample.
-        samples: see `Picture`; one at least.
+        depth: (M,) linear depth of samples, without derivative; one at least.
+        samples: see `Picture`; of as many, or one that stands for all.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
         camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
         opaque: see `Picture`.
     """
-    xp, there, still = namespace(depth), row >= 0, stopped(camera)
-    count = xp.sum(xp.astype(there, depth.dtype))
-    middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
-    lens = _lens(still, middle)
-    depth = xp.where(there, depth, middle)
-    even, unit = even_depth(depth, lens), _even_width(depth, still, lens, size)
-    unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
-    of_layers = [depth_planes(even[k, ...], unit[k, ...]) for k in layers]
+    xp, lens = namespace(depth), _lens(stopped(camera), depth, size)
+    of_layers = [depth_planes(depth, row[k, ...], lens) for k in range(row.shape[0])]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
+    if samples.shape[0] == 1:
+        row = xp.clip(row, None, 0)
     return Picture(camera, samples, row, planes, lens, size, opaque)
 
 
-def _lens(camera: Camera, middle: Array) -> Array:
-    """See `rts.operations.coverage`; `middle` is the depth that even depths count from."""
-    xp, p, (near, _) = namespace(middle), camera.projection, camera.depth_range()
-    return xp.astype(xp.stack([p[3, 3], -p[3, 2], middle, near]), middle.dtype, copy=False)
-
-
-def _even_width(depth: Array, camera: Camera, lens: Array, size: tuple[int, int]) -> Array:
-    """The even depth of a cell's width at depths."""
-    p, xp = camera.projection, namespace(depth)
+def _lens(camera: Camera, depth: Array, size: tuple[int, int]) -> Array:
+    """See `depth_planes`; even depths count from the mean of some samples' depths, so that they are exact there."""
+    xp, p, (near, _) = namespace(depth), camera.projection, camera.depth_range()
+    middle = xp.clip(xp.mean(depth[:: max(1, depth.shape[0] // SOME)]), near, None)
     width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return width * (lens[0] + lens[1] * lens[2]) / (lens[0] + lens[1] * depth)
+    lens = p[3, 3], -p[3, 2], middle, near, width * (p[3, 3] - p[3, 2] * middle)
+    return xp.astype(xp.stack(lens), depth.dtype, copy=False)

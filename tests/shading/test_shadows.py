@@ -244,14 +244,21 @@ def test_a_shadow_tells_the_light_and_what_casts_it(unknown):
 
 
 def test_compiled_planes_are_the_specification():
-    """Two smooth bodies over a slope, with holes."""
+    """Two smooth bodies over a slope, with holes; through a perspective lens."""
     y, x = np.mgrid[:40, :50] + 0.5
     depth = 30 + 0.3 * x - 0.1 * y
     for center, radius in (((15, 20), 12.2), ((30, 18), 8.1)):
         height = radius**2 - (x - center[0]) ** 2 - (y - center[1]) ** 2
         depth = np.where(height > 0, 20 - np.sqrt(abs(height)), depth)
-    unit = np.where(np.random.default_rng(0).random(depth.shape) < 0.95, 1.0, 0.0)
-    np.testing.assert_allclose(PLANES(depth, unit), PLANES.specification(depth, unit), atol=1e-9)
+    rng = np.random.default_rng(0)
+    row = rng.permutation(depth.size).astype(np.int32).reshape(depth.shape)
+    samples = np.empty(depth.size)
+    samples[row] = depth
+    row[rng.random(depth.shape) > 0.95] = -1
+    for lens in ([1.0, 0.0, 25.0, 1.0, 1.0], [0.0, 0.05, 25.0, 1.0, 1.2]):
+        found = PLANES(samples, row, np.array(lens))
+        np.testing.assert_allclose(found, PLANES.specification(samples, row, np.array(lens)), atol=1e-9)
+        assert (found[1] > 0).sum() == (row >= 0).sum()
 
 
 class TestCoverage(OperationConformance):
@@ -276,7 +283,7 @@ class TestCoverage(OperationConformance):
         points[::9, 2] = 0.1
         samples = np.concatenate([np.zeros((height * width, 2)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
         row = np.where(planes[1] > 0, rng.permutation(height * width).reshape(height, width), -1).astype(np.int32)
-        return [samples, points, row, planes, np.array([0.0, 1 / 3, 3.0, 0.2])]
+        return [samples, points, row, planes, np.array([0.0, 1 / 3, 3.0, 0.2, 1.0])]
 
     @pytest.fixture(params=[True, False])
     def params(self, request):
