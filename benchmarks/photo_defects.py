@@ -3,12 +3,13 @@
     python -m benchmarks.photo_defects
     python -m benchmarks.photo_defects --defects exposure all -o out/defects
 
-24 pictures of 256², all fitted, with `--quick` and without a texture. A shadow is a blurred half of the picture that is
-30 % darker; exposures are ±15 % of linear light; cameras are turned by .5° about themselves; focal lengths are 1 % too
-long; a lens distorts by k1 = -.1, of which cameras tell nothing; masks are those of the object, displaced at random,
-smoothly, by up to a seventh of the picture, which leaves a mean overlap of some .85. Pictures with masks, and those
-kept as JPEG, are opaque and show something behind; the others have alpha. "All" are all but the lens. Chamfer as the mesh lies, and once it is moved, turned and scaled onto the truth, which
-pictures do not tell. Needs the models of the folder that RTS_DATA names, and `rts-reconstruct`.
+24 pictures of 256², all fitted, with `--quick` and without a texture. A shadow is a blurred half of the picture that
+is 30 % darker; exposures are ±15 % of linear light; cameras are turned by .5° about themselves; focal lengths are 1 %
+too long; a lens distorts by k1 = -.1, of which cameras tell nothing; masks are those of the object, displaced at
+random, smoothly, by up to a seventh of the picture, which leaves a mean overlap of some .85. Pictures with masks, and
+those kept as JPEG, are opaque and show something behind; the others have alpha. "All" are all but the lens. Chamfer
+as the mesh lies, and once it is moved, turned and scaled onto the truth, which pictures do not tell. Needs the models
+of the folder that RTS_DATA names, and `rts-reconstruct`.
 """
 
 from __future__ import annotations
