@@ -158,10 +158,10 @@ LOOPS = [
         "sheets edges",
     ),
     Defect(
-        "a triangle of two cells counts as small",
+        "a triangle of two cells does not count as large",
         "rts/outlines/silhouettes_loops.py",
-        "small &= wide <= 1",
-        "small &= wide <= 4",
+        "middling & (wide <= WIDTHS[1])",
+        "middling & (wide <= 4)",
         "sheets edges_soups",
     ),
     Defect(

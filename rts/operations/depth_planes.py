@@ -13,10 +13,10 @@ from rts.operations.operation import Operation
 def depth_planes(depth: Array, row: Array, lens: Array) -> Array:
     """The surface in each cell, (9, H, W): even depth, its unit, slopes along x and y, sides' distances, a limit.
 
-    The unit is the even depth of a cell's width; 0 where a cell has no sample. Sides are the left, right, upper and lower one, in cells from the centre; by them motions are extrapolated from
-    within. On a smooth rim motions change with the root of the distance from the outline, as depths
-    do. Where a point's even depth is at most the limit, plus the slopes times the point's x and y, the surface's plane
-    is not in front of it. The result has no derivative.
+    The unit is the even depth of a cell's width; 0 where a cell has no sample. Sides are the left, right, upper and
+    lower one, in cells from the centre; by them motions are extrapolated from within. On a smooth rim motions change
+    with the root of the distance from the outline, as depths do. Where a point's even depth is at most the limit, plus
+    the slopes times the point's x and y, the surface's plane is not in front of it. The result has no derivative.
 
     Args:
         depth: (N,) linear depth of samples, N > 0.

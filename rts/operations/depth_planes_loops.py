@@ -16,7 +16,8 @@ WORK = 30
 def forward(depth: np.ndarray, row: np.ndarray, lens: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (9, H, W)."""
     if not len(depth) or row.max() >= len(depth) or len(lens) != 5:
-        raise InputError(f"a picture has {len(depth)} samples and a lens {lens.shape}; expected some, and (5,)")
+        shapes = f"{depth.shape}, rows up to {row.max()} and a lens {lens.shape}"
+        raise InputError(f"a picture has depths {shapes}; expected one for each row, one at least, and a lens (5,)")
     parallel(_even, len(row), depth, row, lens, out, work=2 * row.size)
     parallel(_forward, len(row), out, work=WORK * row.size)
 

@@ -11,12 +11,19 @@ from rts.sampling.points_loops import corners_of, edge
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""
 
+SMALL, MIDDLING, LARGE = 1, 2, 3
+"""Sizes of triangles: at most `WIDTHS` cells wide and high, or larger, or seen in part."""
+
+WIDTHS = 0.48, 1.48
+"""Widths, in cells: all vertices of a triangle that meets a gap are in the gap's two cells, or in these and those
+beside."""
+
 
 @loop
 def turns(first, last, rows, vertices, faces, seen, sides):
     """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
 
-    A triangle that is more than a cell wide or high, or is seen in part, has 2 or −2, a smaller one 1 or −1.
+    They are multiplied by the triangle's size, such as `SMALL`.
 
     Args:
         first: the first triangle.
@@ -34,11 +41,11 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
         if area == 0 or np.isnan(area):
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        small = True
+        small, middling = True, True
         for axis in range(2):
             wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
-            small &= wide <= 1  # False for NaN.
-        size = 1 if small else 2
+            small, middling = small & (wide <= WIDTHS[0]), middling & (wide <= WIDTHS[1])  # False for NaN.
+        size = SMALL if small else (MIDDLING if middling else LARGE)
         sides[t] = size if area > 0 else (-size if area < 0 else 0)
 
 
@@ -77,10 +84,22 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
             if s >= 0 and (sides[s] * side > 0 or (keep == 0 and s < t and sides[s] != 0)):
                 continue
             a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
-            if not _in_image(a, b, seen, part.shape) or not _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
+            if not _passes_centres(a, b, seen) or not _in_image(a, b, seen, part.shape):
+                continue
+            if not _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
                 continue
             for axis in range(2):
                 _mark(axis, ends, min(deep[0], deep[1]), part, depth, width, gaps)
+
+
+@compiled
+def _passes_centres(a, b, seen):
+    """False for an edge that meets no line of centres, such as most of those that are much shorter than a cell."""
+    found = np.isnan(seen[a, 0]) or np.isnan(seen[b, 0])
+    for axis in range(2):
+        low, high = min(seen[a, axis], seen[b, axis]), max(seen[a, axis], seen[b, axis])
+        found |= np.ceil(low - 0.5 - SLACK) <= np.floor(high - 0.5 + SLACK)
+    return found
 
 
 @compiled

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.outlines.silhouettes_loops import MIDDLING, SMALL
 from rts.sampling.points_loops import corners_of, edge
 
 TINY = 1e-9
@@ -23,6 +24,9 @@ goes on from one to the other."""
 
 MARGIN = 1e-7
 """Share of the depth by which a span must be nearer than another to come before it."""
+
+EMPTY = -9.0
+"""The end of a span that covers nothing, before its start."""
 
 NOTHING, FIRST, SECOND = -1, -2, -3
 """In place of a span: nothing is seen; the sample at the first centre; that at the second."""
@@ -61,16 +65,21 @@ def wanted(first, last, part, joined, met, gaps):
 
 @loop
 def around(gap, cells):
-    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around: 1 along rows, 2 along columns, 3 both.
+    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around.
 
-    A triangle that is at most a cell wide and high, and meets a gap, has all its vertices in cells that are marked.
+    The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside. A
+    triangle that meets a gap has all its vertices in cells that are marked so, by its size: see `silhouettes_loops.
+    turns`.
     """
     height, width = cells.shape
     for n in range(len(gap)):
         y, x, row = gap[n, 0], gap[n, 1], gap[n, 2]
+        kind = 2 - row
         for j in range(max(y - 1, 0), min(y + 2 - row, height - 1) + 1):
             for i in range(max(x - 1, 0), min(x + 1 + row, width - 1) + 1):
-                cells[j, i] |= 2 - row
+                cells[j, i] |= 4 * kind
+        cells[y, x] |= kind
+        cells[y + 1 - row, x + row] |= kind
 
 
 @loop
@@ -155,7 +164,8 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         if sides[t] * keep < 0:
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        axes = 3 if abs(sides[t]) == 2 else close[a] & close[b] & close[c]
+        size, axes = abs(sides[t]), close[a] & close[b] & close[c]
+        axes = axes & 3 if size == SMALL else (axes >> 2 if size == MIDDLING else 3)
         if axes == 0:
             continue
         _box(a, b, c, seen, len(by_row), len(by_column), box)
@@ -288,10 +298,10 @@ def _fill(spans, n, start, end, line, corners, origin):
 
 
 @loop
-def by_gap(gaps, count):
+def by_gap(gaps, starts, count):
     """Where the spans of each of `count` gaps begin in a list in their order (count + 1,); and this list.
 
-    `gaps` (N,) are those of spans, or −1.
+    `gaps` (N,) are those of spans, or −1; `starts` (N,) is where spans start, by which those of a gap are sorted.
     """
     begins = np.zeros(count + 1, np.int64)
     for gap in gaps:
@@ -304,6 +314,9 @@ def by_gap(gaps, count):
         if gaps[n] >= 0:
             order[next_[gaps[n]]] = n
             next_[gaps[n]] += 1
+    for g in range(count):
+        own = order[begins[g] : begins[g + 1]]
+        own[:] = own[np.argsort(starts[own], kind="mergesort")]
     return begins, order
 
 
@@ -314,11 +327,21 @@ def depth_at(spans, i, place):
 
 
 @compiled
+def _rest(spans, begin, stop, place):
+    """The first of a gap's spans, `begin` to `stop`, which are sorted by starts, that may not have ended at a place."""
+    while begin < stop and spans[begin, 1] <= place:
+        begin += 1
+    return begin
+
+
+@compiled
 def _nearest(spans, begin, stop, place, beyond):
     """The nearest of a gap's spans, `begin` to `stop`, that covers `place`, and goes on after it; −1 for none."""
     best = NOTHING
     for i in range(begin, stop):
-        if spans[i, 0] <= place + beyond and spans[i, 1] > place + beyond:
+        if spans[i, 0] > place + beyond:
+            break
+        if spans[i, 1] > place + beyond:
             if best < 0 or depth_at(spans, i, place) < depth_at(spans, best, place):
                 best = i
     return best
@@ -327,11 +350,10 @@ def _nearest(spans, begin, stop, place, beyond):
 @compiled
 def _next_start(spans, begin, stop, place):
     """The least start of a span of a gap at or after a place; infinite if there is none."""
-    best = np.inf
     for i in range(begin, stop):
-        if spans[i, 1] > place + TOUCH and spans[i, 0] < best:
-            best = spans[i, 0]
-    return max(best, place)
+        if spans[i, 1] > place + TOUCH:
+            return max(spans[i, 0], place)
+    return np.inf
 
 
 @compiled
@@ -339,6 +361,8 @@ def _overtaken(spans, begin, stop, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
     best, by = spans[x, 1], -9
     for i in range(begin, stop):
+        if spans[i, 0] >= spans[x, 1]:
+            break
         low, high = max(place, spans[i, 0]), min(spans[x, 1], spans[i, 1])
         if i == x or high - low <= TINY:
             continue
@@ -381,10 +405,12 @@ def _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts
     if ends[g, 0, 0] >= 0:
         x = FIRST
         for i in range(begin, stop):
-            if parts[i] == ends[g, 0, 0] and names[i, 1] == ends[g, 0, 1] and spans[i, 0] <= TOUCH:
+            covers = spans[i, 0] <= TOUCH and spans[i, 1] > spans[i, 0]
+            if covers and parts[i] == ends[g, 0, 0] and names[i, 1] == ends[g, 0, 1]:
                 x = i
     while n < room and place < until:
         pieces[n], starts[n] = x, place
+        begin = _rest(spans, begin, stop, place)
         n, by, beyond = n + 1, -9, TOUCH
         if x == NOTHING:
             place = _next_start(spans, begin, stop, place)
@@ -421,7 +447,7 @@ def _agree(spans, begin, stop, seen, depth, centre):
     for i in range(begin, stop):
         if spans[i, 0] < centre - TOUCH and spans[i, 1] > centre + TOUCH:
             if not seen or depth_at(spans, i, centre) < depth - ALIKE * abs(depth):
-                spans[i, 0], spans[i, 1] = 9.0, 9.0
+                spans[i, 1] = EMPTY
 
 
 @compiled
@@ -429,21 +455,22 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
     found, z = False, depth_at(spans, x, place)
     for i in range(begin, stop):
-        if i != x and parts[i] == parts[x] and abs(spans[i, 1 - way] - place) <= TOUCH:
+        if spans[i, 0] > place + TOUCH:
+            break
+        touches = abs(spans[i, 1 - way] - place) <= TOUCH and spans[i, 1] > spans[i, 0]
+        if touches and i != x and parts[i] == parts[x]:
             found |= abs(depth_at(spans, i, place) - z) <= ALIKE * abs(z)
     return found
 
 
 @compiled
-def _kind(before, behind, one_triangle, nearer, seamless, stops, starts):
+def _kind(before, behind, nearer, stops, starts):
     """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
 
     Args:
         before: the part before the place, or −1.
         behind: the part behind, or −1.
-        one_triangle: True if the triangle before is that behind.
         nearer: 0 if the surface before is nearer, 1 if that behind is; −1 if they meet.
-        seamless: True if one part's span ends, where another one of it starts.
         stops: True if the surface before ends there, and goes on with no other span.
         starts: True if that behind starts there, and comes from no other.
     """
@@ -451,15 +478,14 @@ def _kind(before, behind, one_triangle, nearer, seamless, stops, starts):
     if before < 0 or behind < 0:
         if before != behind:
             kind = 1 if before < 0 else 0
-    elif before != behind or not (one_triangle or (nearer < 0 and seamless)):
-        if nearer >= 0:
-            kind = nearer
-        elif stops != starts:
-            kind = 0 if stops else 1
-        elif not stops:
-            kind = 2
-        elif before != behind:
-            kind = 0
+    elif nearer >= 0:
+        kind = nearer
+    elif stops != starts:
+        kind = 0 if stops else 1
+    elif not stops:
+        kind = 2
+    elif before != behind:
+        kind = 0
     return kind
 
 
@@ -532,11 +558,14 @@ def breaks(
             nearer = -1 if abs(z - deep) <= ALIKE * max(abs(z), abs(deep)) else (0 if z < deep else 1)
             # What is seen at a centre goes on beyond it.
             stops, begun = x >= 0 and spans[x, 1] <= place + TOUCH, y >= 0 and spans[y, 0] >= place - TOUCH
-            seamless = before == behind and (x < 0 or stops) and (y < 0 or begun)
+            seamless = nearer < 0 and (x < 0 or stops) and (y < 0 or begun)
+            if before == behind and (t == s or seamless):
+                continue
             if nearer < 0:
+                begin = _rest(spans, begin, stop, place - 2 * TOUCH)
                 stops = stops and not _goes_on(spans, begin, stop, parts, x, place, 1)
                 begun = begun and not _goes_on(spans, begin, stop, parts, y, place, 0)
-            kind = _kind(before, behind, t == s, nearer, seamless, stops, begun)
+            kind = _kind(before, behind, nearer, stops, begun)
             if kind == 3:
                 continue
             whole[row, 0], whole[row, 1], whole[row, 2], whole[row, 3] = g, kind, before, behind

@@ -103,7 +103,8 @@ def test_cells_around_a_gap_are_marked():
     cells = np.zeros((5, 6), np.int8)
     spans_loops.around(np.array([(2, 2, 1)], np.int32), cells)
     expected = np.zeros((5, 6), np.int8)
-    expected[1:4, 1:5] = 1
+    expected[1:4, 1:5] = 4
+    expected[2, 2:4] = 5
     np.testing.assert_array_equal(cells, expected)
 
 

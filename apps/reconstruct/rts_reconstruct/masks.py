@@ -36,7 +36,7 @@ def told(views: list[rts.View], named: str, ignored: bool) -> list[rts.View] | N
         InputError: half of the pictures show no object, or have masks that are black where the object is.
     """
     looked_at = _some(views)
-    masks = [_mask(view) for view in looked_at]
+    masks = [mask_of(view) for view in looked_at]
     images = [view.image for view in looked_at]
     found = None
     if all(image.shape[2] == 4 for image in images):
@@ -64,7 +64,7 @@ def plain(views: list[rts.View], named: str, background: np.ndarray | None) -> t
     if white:
         said = f"the masks of {named} are white all over, so that they tell no object; colours alone are compared"
         warnings.warn(said, rts.errors.RtsWarning, 3)
-    return [_with(view, _opaque, None if view.mask is None else _mask) for view in views], behind
+    return [_with(view, _opaque, None if view.mask is None else mask_of) for view in views], behind
 
 
 def _some(views: list[rts.View]) -> list[rts.View]:
@@ -82,8 +82,8 @@ def _opaque(view: rts.View) -> np.ndarray:
     return view.image[..., :3]
 
 
-def _mask(view: rts.View) -> np.ndarray:
-    """The view's mask, ones if it has none."""
+def mask_of(view: rts.View) -> np.ndarray:
+    """The view's mask (H, W), ones if it has none."""
     return np.ones(view.size, np.float32) if view.mask is None else view.mask
 
 
@@ -101,7 +101,7 @@ def shown(view: rts.View) -> np.ndarray:
 
 def _cut_out(view: rts.View) -> np.ndarray:
     """The picture (H, W, 4) where the view's mask is."""
-    mask = _mask(view)
+    mask = mask_of(view)
     return np.concatenate([view.image[..., :3] * mask[..., None], mask[..., None]], axis=2)
 
 
@@ -115,7 +115,7 @@ def _check_shown(views: Sequence[rts.View], named: str) -> None:
             few = f" (the lightest pixel is {lightest:.3f} of white)" if lightest > 0 else ""
             raise rts.InputError(f"{told}{few}; expected masks, or alpha, that are white where the object is")
         _warn(f"{told}; what these see is taken for empty: leave them out if it is not")
-    full = [i for i, view in enumerate(views) if not ((view.image[..., 3] < 0.5) & (_mask(view) > 0.5)).any()]
+    full = [i for i, view in enumerate(views) if not ((view.image[..., 3] < 0.5) & (mask_of(view) > 0.5)).any()]
     if full:
         _warn(
             f"alpha or masks are missing, or white all over, in {_counted(views, full)} of {named}; all that these see "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import scipy.ndimage
@@ -62,31 +62,39 @@ def _silhouette(solid: trimesh.Trimesh, camera: rts.Camera, size: tuple[int, int
     return alpha, (away > band).astype(np.float32)
 
 
-def write_masks(folder: Path, views: Sequence[rts.View], solid: trimesh.Trimesh, world: World) -> None:
-    """Write NAME.png for each view of a data set: white for the object, black behind it, grey where it is not known."""
-    for number, view in enumerate(views):
+def write_masks(
+    folder: Path, views: Sequence[rts.View], numbers: Sequence[int], solid: trimesh.Trimesh, world: World
+) -> None:
+    """Write a mask for each view of a data set: white for the object, black behind it, grey where it is not known.
+
+    Args:
+        folder: where to write; masks are called as pictures are, with .png appended, in folders as these.
+        views: the views.
+        numbers: their numbers in the data set.
+        solid: the object.
+        world: its world.
+    """
+    for file, view in zip(_files(views, numbers), views, strict=True):
         height, width = view.size
         shrink = max(1.0, max(view.size) / LARGEST)
         size = (max(1, round(height / shrink)), max(1, round(width / shrink)))
         alpha, counts = _silhouette(solid, world.camera(view.camera), size)
         if view.mask is not None:
-            counts = counts * (np.asarray(Image.fromarray(view.mask).resize(size[::-1], Image.Resampling.BOX)) > 0.5)
+            own = Image.fromarray(np.asarray(view.mask, np.float32)).resize(size[::-1], Image.Resampling.BOX)
+            counts = counts * (np.asarray(own) > 0.5)
         levels = np.where(counts < 0.5, GREY, np.where(alpha > 0.5, WHITE, BLACK)).astype(np.uint8)
-        _write(folder, view, number, levels)
+        _write(folder / file, Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST))
 
 
-def write_alphas(folder: Path, views: Sequence[rts.View]) -> None:
-    """Write NAME.png for each view of a data set: white where its alpha tells the object, black elsewhere."""
-    for number, view in enumerate(views):
-        _write(folder, view, number, np.where(view.image[..., 3] > 0.5, WHITE, BLACK).astype(np.uint8))
+def write_alphas(folder: Path, views: Sequence[rts.View], numbers: Sequence[int]) -> None:
+    """Write a mask for each view of a data set, as `write_masks`: white where its alpha tells the object."""
+    for file, view in zip(_files(views, numbers), views, strict=True):
+        _write(folder / file, Image.fromarray(np.where(view.image[..., 3] > 0.5, WHITE, BLACK).astype(np.uint8)))
 
 
-def _write(folder: Path, view: rts.View, number: int, levels: np.ndarray) -> None:
-    """Write the mask of a view in the size of its picture, from levels in another."""
-    folder.mkdir(parents=True, exist_ok=True)
-    height, width = view.size
-    mask = Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST)
-    mask.save(folder / _file(view, number))
+def _write(path: Path, mask: Image.Image) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mask.save(path)
 
 
 def mended(views: Sequence[rts.View], folder: Path) -> list[rts.View]:
@@ -95,7 +103,7 @@ def mended(views: Sequence[rts.View], folder: Path) -> list[rts.View]:
     Raises:
         InputError: masks are missing, of another size, or cannot be read.
     """
-    names = [_file(view, number) for number, view in enumerate(views)]
+    names = _files(views, range(len(views)))
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         named = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
@@ -131,5 +139,10 @@ def _masked(view: rts.View, file: Path) -> rts.View:
     return rts.View(view.camera, image, view.size, name=view.name, mask=mask, path=view.path, lens=view.lens)
 
 
-def _file(view: rts.View, number: int) -> str:
-    return f"{Path(view.name).name or number}.png"
+def _files(views: Sequence[rts.View], numbers: Sequence[int]) -> list[str]:
+    """The names of masks, in their folder: NAME.png; by number where pictures have no names, or equal ones."""
+    names = [PurePosixPath(view.name) for view in views]
+    told = all(name.name and not name.is_absolute() and ".." not in name.parts for name in names)
+    if not told or len(set(names)) < len(names):
+        return [f"{number}.png" for number in numbers]
+    return [f"{name}.png" for name in names]

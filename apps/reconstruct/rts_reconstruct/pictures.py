@@ -42,6 +42,7 @@ class Pictures:
         solid: what the points fill there, as a mesh, where a start or outlines need it; the world of the pictures is
             that of `region` then.
         by_points: True if the outlines are those of `solid`.
+        by_masks: True if they are those of masks, in pictures that show what is around the object, too.
         exposures: (B,) of `exposures.exposures`, that were taken out of the pictures; None for none.
     """
 
@@ -56,6 +57,7 @@ class Pictures:
     region: World | None = None
     solid: trimesh.Trimesh | None = None
     by_points: bool = False
+    by_masks: bool = False
     exposures: np.ndarray | None = None
 
 
@@ -83,7 +85,7 @@ def read(
         region: center and radius (4,) of a ball that the object is in, world of the data set; None for that of the
             points.
         start: the kind of start, of which "points" needs the solid.
-        refine: True to refine masks by the pictures' colours first; see `refining.can_refine`. It needs OpenCV.
+        refine: True to refine masks, white where the object is, by the pictures' colours first. It needs OpenCV.
 
     Raises:
         InputError: no views, one view, pictures that do not tell the object, or half of them without it, or an argument
@@ -101,12 +103,15 @@ def read(
             "two, and thirty around a thing for all of its surface"
         )
     if refine:
-        views = [refined(view, None if view.lens is None else masks_of.shown(view)) for view in views]
+        views = [
+            refined(view, masks_of.mask_of(view), None if view.lens is None else masks_of.shown(view)) for view in views
+        ]
     given, named = views, _named(path)
     points = seen_points.read(path)
     ball = None if points is None else _region(points, given, region)
     views = [_smaller(view, size) for view in views]
     alphas = masks_of.told(views, named, ignored=masks == "ignore")
+    by_masks = alphas is not None and alphas is not views
     if points is None and alphas is None and background is None:
         seen_points.check_readable(path)
     if points is None and region is not None:
@@ -136,7 +141,7 @@ def read(
     fitted, held = [views[i] for i in kept], [views[i] for i in others]
     outlined = alphas is not None or by_points
     whole = [given[i] for i in numbers]
-    return Pictures(fitted, held, numbers, whole, outlined, behind, world, points, ball, solid, by_points)
+    return Pictures(fitted, held, numbers, whole, outlined, behind, world, points, ball, solid, by_points, by_masks)
 
 
 def _region(points: Points, views: Sequence[rts.View], region: Any) -> World | None:

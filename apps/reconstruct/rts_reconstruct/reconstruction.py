@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -127,18 +129,18 @@ def reconstruct(
         pictures.read, views, held_out=held_out, background=background, masks=masks, region=region, start=start
     )
     shots = read(size=size)
-    consistent = given = job.shared(lambda: consistency(shots))
-    if given < INEXACT and refining.can_refine(shots.given) and refining.is_installed():
-        finer = functools.partial(read, refine=True)
-        refined = finer(size=size)
-        found = job.shared(lambda: consistency(refined))
-        if found > given:
-            read, shots, consistent = finer, refined, found
+    before = after = job.shared(lambda: consistency(shots))
+    refine = False
+    if before < INEXACT and shots.by_masks and job.shared(refining.is_installed):
+        refined = _refined(read, size)
+        after = job.shared(lambda: consistency(refined)) if refined.outlined else 0.0
+        refine, after = after > before, max(before, after)
+        shots = refined if refine else shots
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
-    settings = stages.Settings(batch, seed, fit_cameras, surface, progress, robust=consistent < INEXACT)
+    settings = stages.Settings(batch, seed, fit_cameras, surface, progress, robust=after < INEXACT)
     near = mesh is shots.solid  # Which the first stage's few faces would make coarser.
     plan = [
         (s._replace(faces=int(defaults["faces"] * s.faces)), max(1, round(s.share * steps)))
@@ -149,17 +151,26 @@ def reconstruct(
         if first:
             files.forget_unfinished(folder)
             if shots.by_points and shots.solid is not None:
-                outlining.write_masks(folder / "masks", shots.given, shots.solid, shots.world)
-            elif consistent > given:
-                outlining.write_alphas(folder / "masks", shots.given)
+                outlining.write_masks(folder / "masks", shots.given, shots.numbers, shots.solid, shots.world)
+            elif refine:
+                outlining.write_alphas(folder / "masks", shots.given, shots.numbers)
     if first:
-        for note in _notes(shots, folder, given, consistent):
+        for note in _notes(shots, folder, before, after):
             print(f"rts: {note}", file=sys.stderr)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
     identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
-    identity |= {"masks": str(masks), "region": region}
+    identity |= {"masks": str(masks), "region": region, "refined": refine}
     saved = Saved(folder / "checkpoint", identity)
-    run = Run(shots, settings, saved, watch if first else None, model, folder, first, lambda: read(size=FINER * size))
+    run = Run(
+        shots,
+        settings,
+        saved,
+        watch if first else None,
+        model,
+        folder,
+        first,
+        lambda: read(size=FINER * size, refine=refine),
+    )
     run.begin(resume)
     try:
         for number, (stage, count) in enumerate(plan):
@@ -172,23 +183,29 @@ def reconstruct(
     return run.finish(light, trim)
 
 
-def _notes(shots: pictures.Pictures, folder: Path, given: float, consistent: float) -> list[str]:
+def _refined(read: Callable[..., pictures.Pictures], size: int) -> pictures.Pictures:
+    """The pictures with refined masks; what their reading warns of has been said of the pictures as they are."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rts.errors.RtsWarning)
+        return read(size=size, refine=True)
+
+
+def _notes(shots: pictures.Pictures, folder: Path, before: float, after: float) -> list[str]:
     """Lines on what the points and masks tell, before the fit."""
     notes = [*picture_files.turned(shots.given), *picture_files.repeated(shots.given), *contradictions(shots)]
     seen = folder / "masks"
-    if consistent > given:
+    if after > before:
         notes.append(
-            f"outlines of masks were moved to edges of the pictures, which makes masks overlap with pictures of what "
-            f"they have in common by {consistent:.2f} in the median, not {given:.2f}; look at {seen}, and mend them "
-            f"with --masks {seen}"
+            "outlines of masks were moved to edges of the pictures, which makes masks overlap with pictures of what "
+            f"they have in common by {after:.2f} in the median, not {before:.2f}; look at {seen}, and mend them with "
+            f"--masks {seen}"
         )
-    if consistent < INEXACT:
-        lacking = refining.can_refine(shots.given) and not refining.is_installed()
+    if after < INEXACT:
+        lacking = shots.by_masks and not refining.is_installed()
         notes.append(
-            f"masks overlap with pictures of what they have in common by {consistent:.2f} in the median, where right "
-            "ones do by some 0.9: they are inexact, or cameras are off, for which there is --fit-cameras; large "
-            "differences count less in the fit"
-            + ("; with OpenCV (the extra photos) masks are refined by the pictures" if lacking else "")
+            f"masks overlap with pictures of what they have in common by {after:.2f} in the median, where right ones "
+            "do by some 0.9: they are inexact, or cameras are off, for which there is --fit-cameras; large differences "
+            "count less in the fit" + ("; with OpenCV (the extra photos) masks are refined by the pictures" * lacking)
         )
     if shots.by_points and shots.region is not None:
         ball = ",".join(f"{x:.4g}" for x in (*shots.region.center, shots.region.unit))

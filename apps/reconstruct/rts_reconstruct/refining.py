@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Sequence
+import functools
 
 import numpy as np
 import scipy.ndimage
@@ -18,31 +17,31 @@ ROUNDS = 3
 """Rounds of GrabCut: in each one the colours of both sides are learnt, and the cheapest cut found."""
 
 
-def can_refine(views: Sequence[rts.View]) -> bool:
-    """True if masks tell the object in pictures (H, W, 3), which show what is around it, too."""
-    return all(view.mask is not None for view in views) and views[0].image.shape[2] == 3
-
-
 def is_installed() -> bool:
-    """True if OpenCV is there."""
-    return importlib.util.find_spec("cv2") is not None
+    """True if OpenCV is there, and runs."""
+    try:
+        import cv2  # noqa: F401  # pyright: ignore[reportUnusedImport]
+    except ImportError:
+        return False
+    return True
 
 
-def refined(view: rts.View, shown: np.ndarray | None) -> rts.View:
-    """A view with alpha by its mask, whose outline has moved to an edge of the picture nearby.
+def refined(view: rts.View, mask: np.ndarray, shown: np.ndarray | None) -> rts.View:
+    """A view with alpha by a mask, whose outline has moved to an edge of the picture nearby.
 
     Args:
-        view: a view of a data set, with an encoded image (H, W, 3), and a mask that is white where the object is.
+        view: a view of a data set, with an encoded image (H, W, 3), or (H, W, 4) whose alpha tells nothing.
+        mask: (H, W), white where the object is.
         shown: (H, W), 0 where the view's lens leaves no picture; None if there is a picture everywhere.
     """
-    known: list[np.ndarray] = []
+
+    @functools.cache
+    def inside() -> np.ndarray:
+        return _inside(view.image[..., :3], mask)
 
     def image() -> np.ndarray:
-        colors = view.image
-        if not known:
-            known.append(_inside(colors, np.asarray(view.mask)))
-        alpha = _resized(known[0], view.size)[..., None] > 0.5
-        return np.concatenate([colors * alpha, alpha.astype(np.float32)], axis=2)
+        alpha = _resized(inside(), view.size)[..., None] > 0.5
+        return np.concatenate([view.image[..., :3] * alpha, alpha.astype(np.float32)], axis=2)
 
     counts = None if shown is None else lambda: shown
     return rts.View(view.camera, image, view.size, name=view.name, mask=counts, path=view.path, lens=view.lens)

@@ -107,7 +107,7 @@ def test_pixels_near_the_outline_of_a_solid_do_not_count():
 def test_masks_that_were_written_are_read_again_as_they_are_mended(tmp_path):
     world, ball = World(CENTER, 1.0), trimesh.creation.icosphere(3, radius=0.6)
     plain = views(on_white)
-    outlining.write_masks(tmp_path, plain, ball, world)
+    outlining.write_masks(tmp_path, plain, range(len(plain)), ball, world)
     levels = np.array(Image.open(tmp_path / "0.png.png"))
     assert set(np.unique(levels)) == {outlining.BLACK, outlining.GREY, outlining.WHITE}
     levels[:4] = outlining.WHITE
@@ -194,15 +194,14 @@ def misplaced():
 
 def test_masks_are_refined_to_the_edges_of_the_pictures(misplaced):
     views, truth = misplaced
-    assert refining.can_refine(views)
-    refined = [refining.refined(view, None).image for view in views]
+    refined = [refining.refined(view, view.mask, None).image for view in views]
     for image, view, right in zip(refined, views, truth, strict=True):
         alpha = image[..., 3] > 0.5
         assert (alpha & right).sum() / (alpha | right).sum() > 0.97
         rough = view.mask > 0.5
         assert (rough & right).sum() / (rough | right).sum() < 0.87
         np.testing.assert_array_equal(image[..., :3], view.image * alpha[..., None])
-    again = [refining.refined(view, None).image for view in views]
+    again = [refining.refined(view, view.mask, None).image for view in views]
     np.testing.assert_array_equal(refined, again)
     before, after = (contradictions.consistency(pictures.read(views, 96, 0, refine=refine)) for refine in (False, True))
     assert before < contradictions.INEXACT < after
@@ -211,20 +210,54 @@ def test_masks_are_refined_to_the_edges_of_the_pictures(misplaced):
 def test_masks_are_refined_in_few_pixels_and_made_as_large_as_their_pictures(misplaced, monkeypatch):
     views, truth = misplaced
     monkeypatch.setattr(refining, "LARGEST", 48)
-    alpha = refining.refined(views[0], None).image[..., 3] > 0.5
+    alpha = refining.refined(views[0], views[0].mask, None).image[..., 3] > 0.5
     assert (alpha & truth[0]).sum() / (alpha | truth[0]).sum() > 0.93
 
 
 def test_masks_without_a_side_stay_as_they_are(misplaced):
     view = misplaced[0][0]
     for mask in (np.ones(view.size), np.zeros(view.size)):
-        white = rts.View(view.camera, view.image, mask=mask.astype(np.float32))
-        np.testing.assert_array_equal(refining.refined(white, None).image[..., 3], mask)
+        found = refining.refined(view, mask.astype(np.float32), None).image[..., 3]
+        np.testing.assert_array_equal(found, mask)
 
 
-def test_pictures_with_alpha_have_no_masks_to_refine(misplaced):
-    assert not refining.can_refine(views())
-    assert not refining.can_refine([rts.View(view.camera, view.image) for view in misplaced[0]])
+def test_only_masks_are_refined_and_not_alpha_or_what_does_not_count(misplaced):
+    shown = misplaced[0]
+    assert pictures.read(shown, 96, 0).by_masks
+    opaque = [rts.View(v.camera, np.concatenate([v.image, np.ones((96, 96, 1))], axis=2), mask=v.mask) for v in shown]
+    assert pictures.read([*opaque[:3], *shown[3:]], 96, 0).by_masks  # Some of them with an alpha that tells nothing.
+    refined = pictures.read([*opaque[:3], *shown[3:]], 96, 0, refine=True)
+    assert refined.outlined and contradictions.consistency(refined) > contradictions.INEXACT
+    assert not pictures.read(views(), SIZE, 0).by_masks
+    assert not pictures.read(shown, 96, 0, np.ones(3), masks="ignore").by_masks
+
+
+def test_masks_of_a_data_set_on_disk_are_refined(misplaced, tmp_path, capsys):
+    """JPEG and masks beside, in folders whose pictures have the same names."""
+    shown, truth = misplaced
+    for i, view in enumerate(shown):
+        for folder, pixels in (("images", view.image), ("masks", view.mask)):
+            path = tmp_path / "set" / folder / f"{i // 4}" / (f"{i % 4}.jpg" + ".png" * (folder == "masks"))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.uint8(255 * pixels)).save(path, quality=95)
+    named = [rts.View(view.camera, view.image, name=f"{i // 4}/{i % 4}.jpg") for i, view in enumerate(shown)]
+    rts.save_views(tmp_path / "set/sparse/0", named)
+    quick = {"steps": 3, "size": 48, "texture": 0, "held_out": 0, "progress": False}
+    rts_reconstruct.reconstruct(tmp_path / "set", tmp_path / "out", **quick)
+    assert "outlines of masks were moved to edges of the pictures" in capsys.readouterr().err
+    for i, right in enumerate(truth):
+        with Image.open(tmp_path / f"out/masks/{i // 4}/{i % 4}.jpg.png") as mask:
+            white = np.asarray(mask) > 128
+        assert (white & right).sum() / (white | right).sum() > 0.95
+
+
+def test_masks_of_pictures_without_names_are_numbered_as_in_the_data_set(misplaced, tmp_path):
+    shown = [rts.View(view.camera, view.image, mask=view.mask) for view in misplaced[0]]
+    found = pictures.read(shown, 96, 3, refine=True)
+    outlining.write_alphas(tmp_path, found.given, found.numbers)
+    mended = pictures.read(shown, 96, 3, masks=tmp_path)
+    for one, other in zip(found.views + found.held_out, mended.views + mended.held_out, strict=True):
+        np.testing.assert_array_equal(one.image[..., 3], other.image[..., 3])
 
 
 def test_a_reconstruction_refines_masks_and_writes_them_to_be_looked_at(misplaced, tmp_path, capsys):
