@@ -180,7 +180,8 @@ def _entry(group: str, name: str) -> EntryPoint:
     if not claims:
         names = plugins(group)
         hint = "; is its distribution installed, and was it again after its entry points changed (pip install .)?"
-        raise InputError(f"no {_kind(group)} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
+        hint = _suggest(name, names) or hint
+        raise InputError(f"no {_kind(group)} named {name!r}; there are {', '.join(names)}{hint}")
     if len(claims) > 1:
         raise PluginError(
             f"the {_kind(group)} {name!r} is claimed by {distributions_of(group, name)}; uninstall one of them"

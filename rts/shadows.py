@@ -16,7 +16,7 @@ from rts.arrays.array_functions import dot, from_numbers, promote, shape_of
 from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checked_parts import check_parts, listed_parts
-from rts.contracts.checks import check_size
+from rts.contracts.checks import check_size, is_count
 from rts.errors import InputError
 from rts.operations.unit import unit
 from rts.rendering.arguments import Layers, SamplerLike
@@ -150,6 +150,8 @@ def with_shadows(
     if "color" in light and "direction" not in light:
         raise InputError("light has a 'color' of distant lights, but no 'direction'; give both")
     check_light({name: value for name, value in light.items() if name != "shadow"})
+    if not is_count(size):
+        raise InputError(f"size is {quoted(size)}; expected one number of pixels: pictures of lights are square")
     sphere = _sphere(part_list, bounds)
     cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
     cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]

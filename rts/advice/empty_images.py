@@ -38,6 +38,9 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
     outside = _outside(proxy, local)
     if outside is not None:
         return f"{{}} {outside}"
+    a, b, c = (proxy.vertices[proxy.faces[:, i]].astype(np.float64) for i in range(3))
+    if not np.cross(b - a, c - a).any():
+        return "the triangles of {} have no area"
     if part.cull == "back":
         return "all that is in sight of {} is seen from behind, which cull='back' leaves out"
     if part.shader.opaque:

@@ -170,7 +170,9 @@ def render(
     ] = None,
     pose: Annotated[
         Path | None,
-        typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
+        typer.Option(
+            help="The pose.json of `rts fit-pose`, for its pose and camera, and its size unless --size is given."
+        ),
     ] = None,
     clip: Annotated[
         str | None, typer.Option(help="A clip of a GLB or glTF, by its name or its number, from 0 on.")
@@ -346,6 +348,8 @@ def fit_pose(
     _say(f"{verdict.word}: IoU {verdict.iou:.3f}{seen_by}")
     for note in verdict.notes:
         _say(escape(f"  {note}"))
+    if not verdict.good:
+        raise typer.Exit(3)
 
 
 @app.command(epilog="Example: rts export teapot.txt --surface bezier -o teapot.obj --tolerance 0.0005")

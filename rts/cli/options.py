@@ -56,6 +56,11 @@ def environment_of(path: Path, up: str) -> Any:
     from rts.shading import prefiltered, turned_environment
 
     image = rts.load_image(path)[..., :3]
+    if image.shape[1] != 2 * image.shape[0]:
+        raise rts.InputError(
+            f"{path} is {image.shape[1]} wide and {image.shape[0]} high; expected a picture of all directions "
+            "(equirectangular), which is twice as wide as high"
+        )
     if up == "z":  # A direction (x, y, z) is (x, z, −y) in the picture.
         image = turned_environment(image, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32))
     return prefiltered(image)

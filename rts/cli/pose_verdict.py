@@ -33,9 +33,14 @@ class Verdict(NamedTuple):
     notes: list[str]
 
     @property
+    def good(self) -> bool:
+        """True if the model covers the mask."""
+        return self.iou >= GOOD
+
+    @property
     def word(self) -> str:
         """The fit in two words."""
-        return "good fit" if self.iou >= GOOD else "poor fit"
+        return "good fit" if self.good else "poor fit"
 
     def numbers(self) -> dict[str, Any]:
         """The entries of a verdict in JSON."""
@@ -61,7 +66,7 @@ def judged(
     if iou < GOOD:
         hidden = "with a part of the mask hidden or wrong the pose may be right all the same (after.png); if not: "
         notes.append(
-            f"poor fit: the model covers the mask with an IoU of {iou:.2f}; expected {GOOD} or more: "
+            f"the model covers the mask with an IoU of {iou:.2f}; expected {GOOD} or more: "
             f"{hidden if robust else ''}is it this model, "
             f"is its start (before.png) roughly right (--camera), and is the field of view (--fov, or --fit-fov)?"
         )

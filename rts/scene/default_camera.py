@@ -94,7 +94,7 @@ def orbit(
     if up not in ("y", "z"):
         raise InputError(f'up is {up!r}; expected "y" or "z"')
     if not 0 < fov < 180:
-        raise InputError(f"fov is {fov}; expected degrees between 0 and 180")
+        raise InputError(f"fov is {fov}; expected degrees, more than 0 and less than 180")
     if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
         raise InputError(f"azimuth is {azimuth} and elevation {elevation}; expected degrees, the second from -90 to 90")
     aspect = size[1] / size[0]

@@ -32,6 +32,9 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
         InputError: `pose` or `center` has another shape, or is not finite.
     """
     if shape_of(pose) != (6,):
+        if shape_of(pose)[1:] == (6,):
+            several = f"pose has shape {shape_of(pose)}; expected (6,), one pose"
+            raise InputError(f"{several}: stack the results of rts.rigid, or take torch.vmap or jax.vmap of it")
         check_numbers("pose", pose, (6,))
         if is_constant(pose):
             pose = np.asarray(pose, np.float64)

@@ -58,7 +58,7 @@ def perspective(
     check_planes(near, far, positive=True)
     value = check_numbers("fov_y", fov_y, ())
     if value is not None and not 0 < value < 180:
-        raise InputError(f"fov_y is {quoted(fov_y)}; expected degrees between 0 and 180")
+        raise InputError(f"fov_y is {quoted(fov_y)}; expected degrees, more than 0 and less than 180")
     check_positive("aspect", aspect)
     check_numbers("principal_point", principal_point, (2,))
     xp, (fov, aspect, near, far, point) = promote(fov_y, aspect, near, far, principal_point)

@@ -277,6 +277,8 @@ def test_render_is_lit_by_an_environment_and_exposed(model, tmp_path, up):
     succeed(*common, "-o", tmp_path / "a.png", "--exposure", "-3", "--shader", "pbr")
     assert 0 < rts.load_image(tmp_path / "a.png")[..., 1].max() < 0.3
     assert "--exposure is for a .png" in fail(*common, "-o", tmp_path / "a.hdr", "--exposure", "1", code=2)
+    rts.save_image(tmp_path / "sky.hdr", above[:, :16])
+    assert "16 wide and 16 high; expected a picture of all directions" in fail(*common, "-o", tmp_path / "a.hdr")
 
 
 def test_render_casts_shadows(tmp_path):
@@ -500,7 +502,9 @@ def test_fit_pose_takes_a_robust_loss(model, tmp_path):
     image = rts.render(dark, orbit(bounds_of(parts), (48, 48), 30, 20), (48, 48), splatter="single", layers=1)
     for loss in ("linear", "cauchy"):
         options = "--steps", 1, "--loss", loss, *(("--f-scale", 0.2) if loss == "cauchy" else ())
-        output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / loss, *options)
+        result = run("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / loss, *options)
+        assert result.exit_code == 3, result.output  # After one step, the fit is poor.
+        output = " ".join(result.output.split())
         expected = float(rts.Loss(loss, 0.2)(image[..., 3] - target))
         assert float(re.search(r"loss (\S+) → ", output).group(1)) == pytest.approx(expected, rel=5e-3)
 

@@ -43,10 +43,10 @@ def test_neighbours_are_kept_for_faces_that_nobody_writes_alone():
     np.testing.assert_array_equal(sheets._beyond(free), np.full((2, 3), -1))
 
 
-@pytest.mark.parametrize(("wide", "side"), [(0.9, 1), (1.1, 2), (3.0, 2)])
-def test_triangles_larger_than_a_cell_are_told_from_smaller_ones(wide, side):
+@pytest.mark.parametrize(("wide", "side"), [(0.4, 1), (0.9, 2), (1.6, 3), (9.0, 3)])
+def test_triangles_are_told_apart_by_their_size(wide, side):
     """By the size of the number; its sign tells clockwise from counterclockwise."""
-    corners = [(2, 2), (2 + wide, 2), (2, 2.5)]
+    corners = [(2, 2), (2 + wide, 2), (2, 2.4)]
     there, back = of(corners, [(0, 1, 2)]).sides[0], of(corners, [(0, 2, 1)]).sides[0]
     assert abs(there) == side and there == -back
 

@@ -381,6 +381,11 @@ EMPTY = {
         Camera.look_at((0, 0, 4), (0, 0, 0)),
         "between the centres of pixels",
     ),
+    "a line": (
+        TRIANGLE.replace(theta={"vertices": np.float32([[-1, 0, 0], [0, 0, 0], [1, 0, 0]])}),
+        Camera.look_at((0, 0, 4), (0, 0, 0)),
+        "the triangles of the part have no area",
+    ),
     "transparent": (
         TRIANGLE.replace(
             theta={**TRIANGLE.theta, "color": np.array([1, 1, 1, 0], np.float32)},

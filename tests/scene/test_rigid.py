@@ -27,6 +27,11 @@ POSES = {
 CENTER = [0.3, -0.2, 0.7]
 
 
+def test_several_poses_are_refused_with_what_takes_them():
+    with pytest.raises(InputError, match=r"pose has shape \(19, 6\); expected \(6,\), one pose: stack .* torch.vmap"):
+        rts.rigid(np.zeros((19, 6)))
+
+
 def test_rigid_equals_scipy_on_both_sides_of_the_threshold():
     rng = np.random.default_rng(0)
     axes = rng.normal(size=(60, 3))

@@ -243,6 +243,17 @@ def test_a_shadow_tells_the_light_and_what_casts_it(unknown):
     )  # A pixel of the light's picture.
 
 
+@pytest.mark.parametrize("size", [64, 996])
+def test_even_depths_count_from_what_is_seen(size):
+    """And not from empty cells around it, however many there are; else a float's digits would not tell depths there."""
+    far = rts.Camera.look_at((0, 500, 0.1), (0, 0, 0), fov_y=4, near=0.01, far=1000)
+    card = part(FLOOR, SQUARE)
+    (numpy,) = shadows.seen_from(card, far, (size, size)).pictures
+    (traced,) = jax.jit(lambda v: shadows.seen_from(part(v, SQUARE), far, (size, size), capacity=2**20))(FLOOR).pictures
+    for found in (numpy, traced):
+        assert abs(float(found.lens[2]) - 500) < 1
+
+
 def test_compiled_planes_are_the_specification():
     """Two smooth bodies over a slope, with holes; through a perspective lens."""
     y, x = np.mgrid[:40, :50] + 0.5
@@ -312,6 +323,8 @@ def test_wrong_arguments_are_refused():
             shadows.with_shadows(floor, light)
     with pytest.raises(rts.InputError, match="bounds"):
         shadows.with_shadows(floor, {"direction": np.ones(3)}, bounds=3.0)
+    with pytest.raises(rts.InputError, match="one number of pixels"):
+        shadows.with_shadows(floor, {"direction": np.ones(3)}, size=(32, 32))
     with pytest.raises(rts.InputError, match="zero"):
         shadows.with_shadows(floor, {"direction": np.zeros(3)})
     with pytest.raises(rts.InputError, match="seen_from"):

@@ -248,7 +248,7 @@ def test_masks_of_a_data_set_on_disk_are_refined(misplaced, tmp_path, capsys):
     for i, right in enumerate(truth):
         with Image.open(tmp_path / f"out/masks/{i // 4}/{i % 4}.jpg.png") as mask:
             white = np.asarray(mask) > 128
-        assert (white & right).sum() / (white | right).sum() > 0.95
+        assert (white & right).sum() / (white | right).sum() > 0.9
 
 
 def test_masks_of_pictures_without_names_are_numbered_as_in_the_data_set(misplaced, tmp_path):
