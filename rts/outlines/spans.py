@@ -62,7 +62,8 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
 
     several = [sheet.spans(gaps) for sheet in sheets]
     names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
-    begins, order = spans_loops.by_gap(names[:, 0], spans[:, 0], len(gaps.gap))
+    begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
+    parallel(spans_loops.by_start, len(gaps.gap), begins, spans[:, 0], order, work=50 * len(order))
     return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
 
 

@@ -298,10 +298,10 @@ def _fill(spans, n, start, end, line, corners, origin):
 
 
 @loop
-def by_gap(gaps, starts, count):
+def by_gap(gaps, count):
     """Where the spans of each of `count` gaps begin in a list in their order (count + 1,); and this list.
 
-    `gaps` (N,) are those of spans, or −1; `starts` (N,) is where spans start, by which those of a gap are sorted.
+    `gaps` (N,) are those of spans, or −1.
     """
     begins = np.zeros(count + 1, np.int64)
     for gap in gaps:
@@ -314,10 +314,15 @@ def by_gap(gaps, starts, count):
         if gaps[n] >= 0:
             order[next_[gaps[n]]] = n
             next_[gaps[n]] += 1
-    for g in range(count):
+    return begins, order
+
+
+@loop
+def by_start(first, last, begins, starts, order):
+    """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start."""
+    for g in range(first, last):
         own = order[begins[g] : begins[g + 1]]
         own[:] = own[np.argsort(starts[own], kind="mergesort")]
-    return begins, order
 
 
 @compiled
