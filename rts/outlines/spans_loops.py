@@ -68,8 +68,7 @@ def around(gap, cells):
     """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around.
 
     The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside. A
-    triangle that meets a gap has all its vertices in cells that are marked so, by its size: see `silhouettes_loops.
-    turns`.
+    triangle that meets a gap has all its vertices in cells that are marked so, by its size: see `WIDTHS`.
     """
     height, width = cells.shape
     for n in range(len(gap)):

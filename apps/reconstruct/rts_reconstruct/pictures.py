@@ -103,9 +103,7 @@ def read(
             "two, and thirty around a thing for all of its surface"
         )
     if refine:
-        views = [
-            refined(view, masks_of.mask_of(view), None if view.lens is None else masks_of.shown(view)) for view in views
-        ]
+        views = [refined(view) for view in views]
     given, named = views, _named(path)
     points = seen_points.read(path)
     ball = None if points is None else _region(points, given, region)

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.ndimage
 
 import rts
+from rts_reconstruct import masks
 
 LARGEST = 512
 """Longer sides of pictures whose masks are refined, at most."""
@@ -26,24 +27,22 @@ def is_installed() -> bool:
     return True
 
 
-def refined(view: rts.View, mask: np.ndarray, shown: np.ndarray | None) -> rts.View:
-    """A view with alpha by a mask, whose outline has moved to an edge of the picture nearby.
+def refined(view: rts.View) -> rts.View:
+    """A view of a data set with alpha by its mask, whose outline has moved to an edge of the picture nearby.
 
-    Args:
-        view: a view of a data set, with an encoded image (H, W, 3), or (H, W, 4) whose alpha tells nothing.
-        mask: (H, W), white where the object is.
-        shown: (H, W), 0 where the view's lens leaves no picture; None if there is a picture everywhere.
+    The mask is white where the object is. The image is encoded, (H, W, 3), or (H, W, 4) with an alpha that tells
+    nothing.
     """
 
     @functools.cache
     def inside() -> np.ndarray:
-        return _inside(view.image[..., :3], mask)
+        return _inside(view.image[..., :3], masks.mask_of(view))
 
     def image() -> np.ndarray:
         alpha = _resized(inside(), view.size)[..., None] > 0.5
         return np.concatenate([view.image[..., :3] * alpha, alpha.astype(np.float32)], axis=2)
 
-    counts = None if shown is None else lambda: shown
+    counts = None if view.lens is None else lambda: masks.shown(view)
     return rts.View(view.camera, image, view.size, name=view.name, mask=counts, path=view.path, lens=view.lens)
 
 

@@ -194,14 +194,14 @@ def misplaced():
 
 def test_masks_are_refined_to_the_edges_of_the_pictures(misplaced):
     views, truth = misplaced
-    refined = [refining.refined(view, view.mask, None).image for view in views]
+    refined = [refining.refined(view).image for view in views]
     for image, view, right in zip(refined, views, truth, strict=True):
         alpha = image[..., 3] > 0.5
         assert (alpha & right).sum() / (alpha | right).sum() > 0.97
         rough = view.mask > 0.5
         assert (rough & right).sum() / (rough | right).sum() < 0.87
         np.testing.assert_array_equal(image[..., :3], view.image * alpha[..., None])
-    again = [refining.refined(view, view.mask, None).image for view in views]
+    again = [refining.refined(view).image for view in views]
     np.testing.assert_array_equal(refined, again)
     before, after = (contradictions.consistency(pictures.read(views, 96, 0, refine=refine)) for refine in (False, True))
     assert before < contradictions.INEXACT < after
@@ -210,14 +210,15 @@ def test_masks_are_refined_to_the_edges_of_the_pictures(misplaced):
 def test_masks_are_refined_in_few_pixels_and_made_as_large_as_their_pictures(misplaced, monkeypatch):
     views, truth = misplaced
     monkeypatch.setattr(refining, "LARGEST", 48)
-    alpha = refining.refined(views[0], views[0].mask, None).image[..., 3] > 0.5
+    alpha = refining.refined(views[0]).image[..., 3] > 0.5
     assert (alpha & truth[0]).sum() / (alpha | truth[0]).sum() > 0.93
 
 
 def test_masks_without_a_side_stay_as_they_are(misplaced):
     view = misplaced[0][0]
     for mask in (np.ones(view.size), np.zeros(view.size)):
-        found = refining.refined(view, mask.astype(np.float32), None).image[..., 3]
+        plain = rts.View(view.camera, view.image, mask=mask.astype(np.float32))
+        found = refining.refined(plain).image[..., 3]
         np.testing.assert_array_equal(found, mask)
 
 
