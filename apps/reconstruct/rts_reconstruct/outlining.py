@@ -80,7 +80,7 @@ def write_masks(
         size = (max(1, round(height / shrink)), max(1, round(width / shrink)))
         alpha, counts = _silhouette(solid, world.camera(view.camera), size)
         if view.mask is not None:
-            own = Image.fromarray(np.asarray(view.mask, np.float32)).resize(size[::-1], Image.Resampling.BOX)
+            own = Image.fromarray(np.asarray(view.mask, np.float32)).resize((size[1], size[0]), Image.Resampling.BOX)
             counts = counts * (np.asarray(own) > 0.5)
         levels = np.where(counts < 0.5, GREY, np.where(alpha > 0.5, WHITE, BLACK)).astype(np.uint8)
         _write(folder / file, Image.fromarray(levels).resize((width, height), Image.Resampling.NEAREST))

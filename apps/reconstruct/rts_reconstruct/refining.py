@@ -53,15 +53,15 @@ def _inside(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     shrink = max(1.0, max(mask.shape) / LARGEST)
     height, width = (max(1, round(extent / shrink)) for extent in mask.shape)
     colors, inside = _resized(image, (height, width)), _resized(mask, (height, width)) > 0.5
-    away = scipy.ndimage.distance_transform_edt(inside) + scipy.ndimage.distance_transform_edt(~inside)
-    sure = away > BAND * max(height, width)
+    away = [np.asarray(scipy.ndimage.distance_transform_edt(side)) for side in (inside, ~inside)]
+    sure = away[0] + away[1] > BAND * max(height, width)
     if not (inside & sure).any() or not (~inside & sure).any():
         return inside  # Nothing tells the colours of one side.
     kinds = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     kinds[sure] = np.where(inside[sure], cv2.GC_FGD, cv2.GC_BGD)
     cv2.setRNGSeed(0)  # Which makes the outcome the same each time.
     levels = np.clip(255 * colors, 0, 255).astype(np.uint8)
-    cv2.grabCut(levels, kinds, None, np.zeros((1, 65)), np.zeros((1, 65)), ROUNDS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(levels, kinds, (0, 0, 1, 1), np.zeros((1, 65)), np.zeros((1, 65)), ROUNDS, cv2.GC_INIT_WITH_MASK)
     return (kinds == cv2.GC_FGD) | (kinds == cv2.GC_PR_FGD)
 
 
