@@ -11,6 +11,7 @@ on a name that the library's own registers.
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
 from collections.abc import Iterable, Mapping
 from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distribution, distributions
@@ -293,9 +294,23 @@ def instance(group: str, value: Any) -> Any:
     if not isinstance(value, (str, type)):
         return value
     if (group, value) not in _defaults:
-        loaded = plugin(group, value) if isinstance(value, str) else value()
+        loaded = plugin(group, value) if isinstance(value, str) else _made(group, value)
         _defaults[group, value] = instance(group, loaded)
     return _defaults[group, value]
+
+
+def _made(group: str, kind: type) -> Any:
+    """An instance of a plugin's class with default settings."""
+    try:
+        inspect.signature(kind).bind()
+    except TypeError as error:
+        raise PluginError(
+            f"the {_kind(group)} {kind.__qualname__} cannot be made without arguments ({error}); give each a default, "
+            "or pass an instance in place of its name"
+        ) from None
+    except ValueError:  # A class of C has no signature.
+        pass
+    return kind()
 
 
 def name_of(group: str, value: Any) -> str:

@@ -310,6 +310,17 @@ def one_line(error):
     return message
 
 
+def test_a_plugin_whose_options_lack_defaults_is_refused_by_its_name():
+    class Foggy(rts.Shader):
+        def __init__(self, thickness):
+            self.thickness = thickness
+
+    with pytest.raises(
+        rts.errors.PluginError, match=r"the shader .*Foggy cannot be made without arguments \(missing .*'thickness'\)"
+    ):
+        registry.instance("shaders", Foggy)
+
+
 def test_a_misspelt_name_lists_the_names_and_suggests_one():
     with pytest.raises(rts.InputError) as error:
         rts.plugin("rts.samplers", "rastr")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,15 +30,27 @@ MOST = 5
 """The most names in a line."""
 
 
-def contradictions(pictures: Pictures) -> list[str]:
-    """A line on masks that contradict those of the other views, by name; none if outlines are of points.
+class Contradiction(NamedTuple):
+    """What masks say of one another.
+
+    Attributes:
+        lines: a line for the user, with names; none where they do not contradict one another.
+        liars: numbers of views to fit whose masks do not overlap with what all others show, and these agree.
+    """
+
+    lines: tuple[str, ...] = ()
+    liars: tuple[int, ...] = ()
+
+
+def contradictions(pictures: Pictures) -> Contradiction:
+    """Whether masks contradict those of the other views; nothing is said if outlines are of points.
 
     Masks of one object are the pictures of the space that they have in common. Where they are not, views are named that
     fit worse than others to what all but a few have in common.
     """
     views = pictures.views
     if not pictures.outlined or pictures.by_points or len(views) < FEWEST or _overlaps(views, 0).min() > CONSISTENT:
-        return []
+        return Contradiction()
     found = _overlaps(views, SPARED)
     worst = np.flatnonzero(found < np.median(found) - APART)
     others = [view for i, view in enumerate(views) if i not in set(worst)]
@@ -45,15 +59,18 @@ def contradictions(pictures: Pictures) -> list[str]:
     )
     names += f" and {len(worst) - MOST} more" if len(worst) > MOST else ""
     if len(views) >= ENOUGH and len(worst) and np.median(_overlaps(others, 0)) > CONSISTENT:
-        return [
-            f"masks that do not overlap with what the other views show: {names}; look whether they are inverted (the "
-            "object is white), turned, or of something else, and mend them or leave the pictures out"
-        ]
+        line = (
+            f"masks that do not overlap with what the other views show: {names}; these pictures are left out: look "
+            "whether masks are inverted (the object is white), turned, or of something else, or cameras wrong"
+        )
+        return Contradiction((line,), tuple(map(int, worst)))
     of_all = f", most of all {names}" if len(views) >= ENOUGH else ""
-    return [
-        f"the masks contradict each other{of_all}: what they have in common is not what they show; mend them, "
-        "leave them out if COLMAP has points (--masks ignore), or look whether the cameras are right"
-    ]
+    return Contradiction(
+        (
+            f"the masks contradict each other{of_all}: what they have in common is not what they show; mend them, "
+            "leave them out if COLMAP has points (--masks ignore), or look whether the cameras are right",
+        )
+    )
 
 
 def consistency(pictures: Pictures) -> float:
@@ -71,7 +88,9 @@ def consistency(pictures: Pictures) -> float:
     part = rts.Part(rts.Mesh(np.asarray(mesh.faces, np.int32)), theta, "unlit")
     found = []
     for view in pictures.views:
-        shown = np.asarray(rts.render(part, view.camera, view.size, splatter="none"))[..., 3] > 0.5
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rts.errors.EmptyImageWarning)  # A hull of few cells may be seen nowhere.
+            shown = np.asarray(rts.render(part, view.camera, view.size, splatter="none"))[..., 3] > 0.5
         mask, counts = view.image[..., 3] > 0.5, np.ones(view.size) if view.mask is None else view.mask
         found.append((counts * (shown & mask)).sum() / max((counts * (shown | mask)).sum(), 1))
     return float(np.median(found))

@@ -167,8 +167,8 @@ def _border(images: Sequence[np.ndarray], named: str, white: bool) -> np.ndarray
             fault = f"the masks of {named} are white all over, so that they tell no object"
         raise rts.InputError(
             f"{fault}, and the pictures' borders have no plain colour (they differ by {scatter:.2f}, at most {PLAIN} "
-            "is plain); expected masks that are black outside of the object, points of COLMAP (rts cameras), or the "
-            "background's colour (--background)"
+            "is plain); expected masks that are black outside of the object (--masks FOLDER), points of COLMAP (rts "
+            "cameras), or the background's colour (--background)"
         )
     return behind.astype(np.float32)
 

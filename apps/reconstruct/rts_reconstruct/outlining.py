@@ -104,11 +104,18 @@ def mended(views: Sequence[rts.View], folder: Path) -> list[rts.View]:
         InputError: masks are missing, of another size, or cannot be read.
     """
     names = _files(views, range(len(views)))
-    missing = [name for name in names if not (folder / name).is_file()]
+    files = [_found(folder, name) for name in names]
+    missing = [name for name, file in zip(names, files, strict=True) if file is None]
     if missing:
         named = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         raise rts.InputError(f"{folder} lacks {len(missing)} of {len(views)} masks: {named}")
-    return [_masked(view, folder / name) for view, name in zip(views, names, strict=True)]
+    return [_masked(view, file) for view, file in zip(views, files, strict=True) if file is not None]
+
+
+def _found(folder: Path, name: str) -> Path | None:
+    """The mask called NAME.png, or with .png in place of the picture's ending; None if there is neither."""
+    files = folder / name, (folder / name).with_suffix("").with_suffix(".png")
+    return next((file for file in files if file.is_file()), None)
 
 
 def _masked(view: rts.View, file: Path) -> rts.View:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,16 @@ def read(
     outlined = alphas is not None or by_points
     whole = [given[i] for i in numbers]
     return Pictures(fitted, held, numbers, whole, outlined, behind, world, points, ball, solid, by_points, by_masks)
+
+
+def without(pictures: Pictures, places: Sequence[int]) -> Pictures:
+    """The pictures without some of the views to fit, by their places."""
+    if not places:
+        return pictures
+    gone = set(places)
+    views = [view for i, view in enumerate(pictures.views) if i not in gone]
+    numbers, given = ([x for i, x in enumerate(some) if i not in gone] for some in (pictures.numbers, pictures.given))
+    return replace(pictures, views=views, numbers=numbers, given=given)
 
 
 def _region(points: Points, views: Sequence[rts.View], region: Any) -> World | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ FINER = 2
 TEXTURE_SHARE = 0.2
 """Steps of the texture, as a share of those of the shape."""
 GREY = 0.5
+GAIN = 0.03
+"""By how much more refined masks must overlap with pictures of what they have in common, to be taken."""
 
 
 def reconstruct(
@@ -129,13 +131,15 @@ def reconstruct(
         pictures.read, views, held_out=held_out, background=background, masks=masks, region=region, start=start
     )
     shots = read(size=size)
+    told = job.shared(lambda: contradictions(shots))
+    shots = pictures.without(shots, told.liars)
     before = after = job.shared(lambda: consistency(shots))
     refine = False
     if before < INEXACT and shots.by_masks and job.shared(refining.is_installed):
-        refined = _refined(read, size)
-        after = job.shared(lambda: consistency(refined)) if refined.outlined else 0.0
-        refine, after = after > before, max(before, after)
-        shots = refined if refine else shots
+        refined = pictures.without(_refined(read, size), told.liars)
+        found = job.shared(lambda: consistency(refined)) if refined.outlined else 0.0
+        refine = found > before + GAIN
+        shots, after = (refined, found) if refine else (shots, before)
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
@@ -155,7 +159,7 @@ def reconstruct(
             elif refine:
                 outlining.write_alphas(folder / "masks", shots.given, shots.numbers)
     if first:
-        for note in _notes(shots, folder, before, after):
+        for note in _notes(shots, folder, told.lines, before, after):
             print(f"rts: {note}", file=sys.stderr)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
     identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
@@ -169,7 +173,7 @@ def reconstruct(
         model,
         folder,
         first,
-        lambda: read(size=FINER * size, refine=refine),
+        lambda: pictures.without(read(size=FINER * size, refine=refine), told.liars),
     )
     run.begin(resume)
     try:
@@ -190,9 +194,9 @@ def _refined(read: Callable[..., pictures.Pictures], size: int) -> pictures.Pict
         return read(size=size, refine=True)
 
 
-def _notes(shots: pictures.Pictures, folder: Path, before: float, after: float) -> list[str]:
+def _notes(shots: pictures.Pictures, folder: Path, told: Sequence[str], before: float, after: float) -> list[str]:
     """Lines on what the points and masks tell, before the fit."""
-    notes = [*picture_files.turned(shots.given), *picture_files.repeated(shots.given), *contradictions(shots)]
+    notes = [*picture_files.turned(shots.given), *picture_files.repeated(shots.given), *told]
     seen = folder / "masks"
     if after > before:
         notes.append(

@@ -94,6 +94,8 @@ def verdict(
         findings.append(
             "masks contradict each other, or cameras do not fit them: look at the masks, and leave them out if COLMAP "
             "has points"
+            if settings.robust
+            else "the mesh does not fill its outlines: give more --steps, or another --start"
         )
     if away is not None and away[1] > AWAY:
         findings.append("the mesh is far from COLMAP's points: its outlines are of something else, or --region is")

@@ -140,10 +140,11 @@ def test_inverted_masks_are_refused_with_a_name_and_the_polarity():
 
 
 def test_a_mask_that_contradicts_the_others_is_named():
-    assert contradictions.contradictions(pictures.read(masked(()), SIZE, 0)) == []
+    assert contradictions.contradictions(pictures.read(masked(()), SIZE, 0)) == ((), ())
     with pytest.warns(rts.errors.RtsWarning, match="look whether these are inverted"):
         one = pictures.read(masked([5]), SIZE, 0)
-    (line,) = contradictions.contradictions(one)
+    (line,), liars = contradictions.contradictions(one)
+    assert not liars
     assert "masks contradict each other:" in line  # Of so few views none is outvoted.
     more = []
     for i, camera in enumerate(cameras(20)):
@@ -152,8 +153,12 @@ def test_a_mask_that_contradicts_the_others_is_named():
         more.append(rts.View(camera, image, name=f"{i}.png", mask=1 - alpha if i == 5 else alpha))
     with pytest.warns(rts.errors.RtsWarning, match="5.png"):
         several = pictures.read(more, SIZE, 0)
-    (line,) = contradictions.contradictions(several)
-    assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1
+    (line,), liars = contradictions.contradictions(several)
+    assert "show: 5.png (" in line and "expected" not in line and line.count(".png") == 1 and liars == (5,)
+    rest = pictures.without(several, liars)
+    assert [view.name for view in rest.views] == [view.name for view in rest.given]
+    assert rest.numbers == [i for i in range(20) if i != 5]
+    assert contradictions.consistency(several) < 0.5 and contradictions.consistency(rest) > 0.9
 
 
 def test_masks_that_are_inexact_are_told_by_their_hull():
@@ -252,6 +257,18 @@ def test_masks_of_a_data_set_on_disk_are_refined(misplaced, tmp_path, capsys):
         assert (white & right).sum() / (white | right).sum() > 0.9
 
 
+def test_mended_masks_may_have_png_in_place_of_the_ending(misplaced, tmp_path):
+    shown = [rts.View(view.camera, view.image, name=f"{i}.jpg") for i, view in enumerate(misplaced[0])]
+    for i, view in enumerate(misplaced[0]):
+        Image.fromarray(np.uint8(255 * view.mask)).save(tmp_path / (f"{i}.png" if i % 2 else f"{i}.jpg.png"))
+    found = pictures.read(shown, 96, 0, masks=tmp_path)
+    for one, other in zip(found.views, misplaced[0], strict=True):
+        np.testing.assert_array_equal(one.image[..., 3] > 0.5, np.uint8(255 * other.mask) > 128)
+    (tmp_path / "3.png").unlink()
+    with pytest.raises(rts.InputError, match=r"lacks 1 of 8 masks: 3.jpg.png"):
+        pictures.read(shown, 96, 0, masks=tmp_path)
+
+
 def test_masks_of_pictures_without_names_are_numbered_as_in_the_data_set(misplaced, tmp_path):
     shown = [rts.View(view.camera, view.image, mask=view.mask) for view in misplaced[0]]
     found = pictures.read(shown, 96, 3, refine=True)
@@ -294,7 +311,9 @@ def test_a_verdict_tells_a_blob_from_what_looks_like_the_pictures():
     told = verdict(fine, found, rows, [[1.0] * 20 + [0.1] * 20], 0.0, settings)
     assert not told.blob and told.findings == () and "no fault was found" in str(told)
     blob = verdict(small, found, measured(small, found), [[1.0] * 40], 0.0, settings)
-    assert blob.blob and "not a reconstruction" in str(blob) and "contradict" in str(blob)
+    assert blob.blob and "not a reconstruction" in str(blob) and "give more --steps, or another --start" in str(blob)
+    lying = verdict(small, found, measured(small, found), [[1.0] * 40], 0.0, settings._replace(robust=True))
+    assert "masks contradict each other" in str(lying)
 
 
 def test_a_focal_length_is_a_factor_on_the_camera():

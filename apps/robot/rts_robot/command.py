@@ -91,3 +91,4 @@ def calibrate(
                 f"masks' order, and is the camera's lens right?"
             )
         )
+        raise typer.Exit(3)
