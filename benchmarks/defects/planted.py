@@ -124,14 +124,14 @@ LOOPS = [
     ),
     Defect(
         "the farther of two surfaces ends at a break",
-        "rts/outlines/spans_loops.py",
+        "rts/outlines/fronts_loops.py",
         "(0 if z < deep else 1)\n",
         "(1 if z < deep else 0)\n",
         "edges edges_bodies",
     ),
     Defect(
         "surfaces cross at the mirrored place",
-        "rts/outlines/spans_loops.py",
+        "rts/outlines/fronts_loops.py",
         "at = low + (high - low) * before / (before - after)",
         "at = low + (high - low) * after / (after - before)",
         "edges edges_bodies",

@@ -25,7 +25,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
         sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
-    from rts.outlines import spans_loops
+    from rts.outlines import fronts_loops, spans_loops
 
     met = np.zeros((2, *fronts.part.shape), np.uint8)
     for sheet in sheets:
@@ -42,11 +42,11 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
     seen = *map(read_only, fronts), np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     known = gaps.gap, begins, spans, names, parts, *seen, INNER, rows, counts, whole, numbers
-    parallel(spans_loops.breaks, count, *known, work=600 * count)
+    parallel(fronts_loops.breaks, count, *known, work=600 * count)
     count = counts.sum()
     gap, points, near = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
-    spans_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends)
+    fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends)
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False  # Elsewhere one surface goes on from centre to centre.
     slope, tangent = moving_edges(near, beside, triangles, points[:, 0], sheets, width)
     place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]

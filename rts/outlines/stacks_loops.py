@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.spans_loops import ALIKE, LAST, MARGIN, SHORT, TINY, TOUCH, depth_at
+from rts.outlines.fronts_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at
+from rts.outlines.spans_loops import TINY
 
 CLOSE = 1e-5
 """Distance from a centre, in cells, within which the sample there decides on which side of it a run ends."""

@@ -20,9 +20,6 @@ from rts.operations.coverage import coverage, is_inside
 from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
 
-SOME = 64
-"""Cells along each side of a picture whose mean depth is taken, about."""
-
 
 @record(static=("size", "opaque"))
 class Picture:
@@ -119,7 +116,7 @@ def picture_of(
         size: (height, width) of the picture.
         opaque: see `Picture`.
     """
-    xp, lens = namespace(depth), _lens(stopped(camera), _middle(depth, row), depth, size)
+    xp, lens = namespace(depth), _lens(stopped(camera), depth, size)
     of_layers = [depth_planes(depth, row[k, ...], lens) for k in range(row.shape[0])]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
     if samples.shape[0] == 1:
@@ -127,21 +124,10 @@ def picture_of(
     return Picture(camera, samples, row, planes, lens, size, opaque)
 
 
-def _middle(depth: Array, row: Array) -> Array:
-    """The mean depth in some cells of the first layer, about `SOME` each way; of some samples, if these are empty."""
-    xp, (down, across) = namespace(depth), (max(1, n // SOME) for n in row.shape[1:])
-    some = xp.reshape(row[0, ::down, ::across], (-1,))
-    there = some >= 0
-    total = xp.sum(xp.where(there, xp.take(depth, xp.clip(some, 0, None)), 0.0))
-    count = xp.sum(xp.astype(there, depth.dtype))
-    others = xp.mean(depth[:: max(1, depth.shape[0] // SOME)])
-    return xp.where(count > 0, total / xp.where(count > 0, count, 1.0), others)
-
-
-def _lens(camera: Camera, middle: Array, depth: Array, size: tuple[int, int]) -> Array:
-    """See `depth_planes`; even depths count from `middle`, so that they are most exact there."""
+def _lens(camera: Camera, depth: Array, size: tuple[int, int]) -> Array:
+    """See `depth_planes`; even depths count from the farthest sample."""
     xp, p, (near, _) = namespace(depth), camera.projection, camera.depth_range()
-    middle = xp.clip(middle, near, None)
+    origin = xp.clip(xp.max(depth), near, None)  # Rows that are not used may hold a depth of 0.
     width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    lens = p[3, 3], -p[3, 2], middle, near, width * (p[3, 3] - p[3, 2] * middle)
+    lens = p[3, 3], -p[3, 2], origin, near, width * (p[3, 3] - p[3, 2] * origin)
     return xp.astype(xp.stack(lens), depth.dtype, copy=False)

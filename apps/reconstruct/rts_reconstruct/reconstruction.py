@@ -131,12 +131,12 @@ def reconstruct(
         pictures.read, views, held_out=held_out, background=background, masks=masks, region=region, start=start
     )
     shots = read(size=size)
-    told = job.shared(lambda: contradictions(shots))
-    shots = pictures.without(shots, told.liars)
+    contradiction = job.shared(lambda: contradictions(shots))
+    shots = pictures.without(shots, contradiction.liars)
     before = after = job.shared(lambda: consistency(shots))
     refine = False
     if before < INEXACT and shots.by_masks and job.shared(refining.is_installed):
-        refined = pictures.without(_refined(read, size), told.liars)
+        refined = pictures.without(_refined(read, size), contradiction.liars)
         found = job.shared(lambda: consistency(refined)) if refined.outlined else 0.0
         refine = found > before + GAIN
         shots, after = (refined, found) if refine else (shots, before)
@@ -159,7 +159,7 @@ def reconstruct(
             elif refine:
                 outlining.write_alphas(folder / "masks", shots.given, shots.numbers)
     if first:
-        for note in _notes(shots, folder, told.lines, before, after):
+        for note in _notes(shots, folder, contradiction.lines, before, after):
             print(f"rts: {note}", file=sys.stderr)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
     identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
@@ -173,7 +173,7 @@ def reconstruct(
         model,
         folder,
         first,
-        lambda: pictures.without(read(size=FINER * size, refine=refine), told.liars),
+        lambda: pictures.without(read(size=FINER * size, refine=refine), contradiction.liars),
     )
     run.begin(resume)
     try:
