@@ -39,6 +39,7 @@ from scipy.ndimage import gaussian_filter
 import rts
 from benchmarks.paper.snerf_scenes import SHOWN, Scene, Shot, fern, lego, real
 from rts.arrays.trees import leaves, map_leaves
+from rts_surfaces.radiance_field.shader import RadianceShader
 
 HIGHEST = 8.0
 """The grid lies between 0, no density, and this: log(1 + density) of 3,000, near the greatest of these fields."""
@@ -311,16 +312,27 @@ def drawn(
     scene: Scene, values: np.ndarray, weights: Any, shots: Sequence[Shot], supersample: int = 1
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """A surface light field: images and numbers."""
-    images, seconds, evaluations, covered = [], [], [], []
-    part = rts.prepare(scene.part(values, weights))
+    images, seconds, evaluations, covered, shaded = [], [], [], [], []
+
+    class Counted(RadianceShader):
+        """The shader, which counts the samples that it is given."""
+
+        takes_views, reads = True, RadianceShader.reads
+
+        def __call__(self, theta: Any, gbuffer: Any, camera: Any) -> Any:
+            shaded.append(int(gbuffer["position"].shape[0]))
+            return super().__call__(theta, gbuffer, camera)
+
+    part = rts.prepare(scene.part(values, weights, Counted(ndc=scene.ndc)))
     _image(part, scene, shots[0].camera, shots[0].size)  # The triangles are found once.
     for shot in shots:
+        shaded.clear()
         begun = time.perf_counter()
         images.append(np.asarray(_image(part, scene, shot.camera, shot.size, supersample=supersample)))
         seconds.append(time.perf_counter() - begun)
+        evaluations.append(sum(shaded))
         options = {"splatter": scene.splatter, "layers": LAYERS[scene.splatter], "supersample": supersample}
         found = rts.sample(part, shot.camera, shot.size, **options)
-        evaluations.append(int(found.samples[0].ids.shape[0]))
         apron, fine = found.apron, supersample
         row = found.row[0, apron:-apron, apron:-apron] >= 0
         pixels = row.reshape(shot.size[0], fine, shot.size[1], fine).any(axis=(1, 3))

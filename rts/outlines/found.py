@@ -11,14 +11,16 @@ import numpy as np
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec, Outlines
+from rts.sampling.entries import is_still
+from rts.sampling.scene import Scene
 
 
 class Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 6) int32, for each break the two last samples, the two that tell colours (−1 where each part has
-            one), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last samples, and those of
+        rows: (B, 6) int32, for each break the two last samples, the two that tell colours (−1 where `Told` is of one
+            kind), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last samples, and those of
             the stack there.
         parts: of the shape of `rows`, int32, their parts, or −1.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
@@ -79,9 +81,26 @@ _SHARED = tuple(f.name for f in fields(Outlines) if f.name in Found._fields)
 _shared_of = attrgetter(*_SHARED)
 
 
-def samples_of_break(layers: int, uniform: bool) -> int:
-    """The largest number of samples of a break, but for a pair; `uniform` if each part has one colour."""
-    return (2 if uniform else 4) if layers == 1 else layers + 3
+class Told(NamedTuple):
+    """What samples beside breaks have to tell. Two of one layer do if it is of one kind, else there are four.
+
+    Attributes:
+        colors: False if each part has one colour, which any of its samples tells.
+        motions: False if all is constant that moves samples, and colours are to be told.
+    """
+
+    colors: bool = True
+    motions: bool = True
+
+    @classmethod
+    def of(cls, *scenes: Scene) -> Told:
+        """What the shaders of scenes, and derivatives in their values, have to be told."""
+        uniform = all(part.uniform for scene in scenes for part in scene.parts)
+        return cls(not uniform, uniform or not all(map(is_still, scenes)))
+
+    def samples(self, layers: int) -> int:
+        """The largest number of samples of a break, but for a pair."""
+        return (4 if self.colors and self.motions else 2) if layers == 1 else layers + 3
 
 
 def columns(layers: int) -> tuple[int, int, int]:

@@ -16,7 +16,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Found, samples_of_break
+from rts.outlines.found import Found, Told
 from rts.outlines.gaps import Fronts
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
@@ -30,8 +30,8 @@ def with_outlines(
     sampled: Sampled,
     scene: Scene,
     grid: Grid,
+    told: Told,
     capacity: int | None = None,
-    uniform: bool = False,
     most: int | None = None,
 ) -> Sampled:
     """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
@@ -42,9 +42,9 @@ def with_outlines(
         sampled: the samples at centres.
         scene: the scene.
         grid: the cells.
+        told: what samples beside breaks have to tell: where it is of one kind, `Outlines.inner` is −1.
         capacity: `Request.capacity`. Where values are traced, there is room for `most_breaks`, or for fewer if a shared
             table has no room for their samples. `overflow` counts those beyond.
-        uniform: whether each part has one colour, so that no samples need tell it: `Outlines.inner` is then −1.
         most: the most breaks to find where values are known; None for all.
 
     Warns:
@@ -63,10 +63,10 @@ def with_outlines(
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
         room = most_breaks(grid, capacity) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, room, capacity, uniform, inputs)
+        found, more = _found_on_host(sampled, scene, grid, room, capacity, told, inputs)
     else:
         centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
-        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), uniform)], [centres], most)
+        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), told)], [centres], most)
         specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
@@ -114,13 +114,13 @@ def _found_on_host(
     grid: Grid,
     most: int | None,
     capacity: int | None,
-    uniform: bool,
+    told: Told,
     inputs: Tree,
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
     owners, layers = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0]
     room = [
-        _Room.of(part, sampler, samples, layers, uniform, most, capacity)
+        _Room.of(part, sampler, samples, layers, told, most, capacity)
         for part, sampler, samples in zip(scene.parts, scene.samplers, sampled.samples, strict=True)
     ]
 
@@ -137,7 +137,7 @@ def _found_on_host(
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         here, own_grid, centres, known = entered(arrays)
-        points, count = Points.of(here, own_grid, known, uniform), most
+        points, count = Points.of(here, own_grid, known, told), most
         (found,), more = found_in_views([points], [centres], count)
         while count and not all(own.holds(samples) for own, samples in zip(room, more, strict=True)):
             count //= 2
@@ -188,14 +188,14 @@ class _Room(NamedTuple):
         sampler: Sampler,
         samples: Samples,
         layers: int,
-        uniform: bool,
+        told: Told,
         most: int | None,
         capacity: int | None,
     ) -> _Room:
         """Room for the samples of at most so many breaks, in addition to `samples` of the part at centres."""
         # Where there is a pair, one of the last samples is there again.
-        of_pairs, surface = 3 if layers == 1 and has_pairs(part, sampler) else 0, part.surface
-        each = samples_of_break(layers, uniform) + of_pairs
+        of_pairs, surface = 3 if layers == 1 and told.motions and has_pairs(part, sampler) else 0, part.surface
+        each = told.samples(layers) + of_pairs
         rows, names = each * (most or 0), set(samples.tables) - set(samples.by_sample)
         if not names or not isinstance(surface, TriangleSurface):
             return cls(rows, {})

@@ -16,7 +16,7 @@ from rts.arrays.engines import Context, engine_of, is_constant, is_traced, names
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import OF_SAMPLES, OF_SEGMENTS, ArraySpec, Cells, Outlines, Request, Sampled, Samples
-from rts.outlines.found import Found, samples_of_break
+from rts.outlines.found import Found, Told
 from rts.outlines.of_scene import most_breaks, with_outlines
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
@@ -28,7 +28,7 @@ from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import View, joined
 
 
-def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, uniform: bool) -> Sampled | None:
+def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, told: Told) -> Sampled | None:
     """The samples of a scene with their outlines, by one call to the host.
 
     The cells of each part's samples are its rows, one after the other, −1 for those that are not in use. Samples beyond
@@ -39,7 +39,7 @@ def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int,
         grid: the cells.
         request: what samplers are asked for.
         layers: K.
-        uniform: as of `with_outlines`.
+        told: as of `with_outlines`.
 
     Returns:
         None for values that are known, and where parts cannot be sampled along with others (`is_suited`).
@@ -52,7 +52,7 @@ def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int,
     traced = any(map(is_traced, operands))
     if not traced and not any(map(is_batched, operands)):
         return None
-    return _Call(scene, grid, request, layers, uniform, values, traced).sampled()
+    return _Call(scene, grid, request, layers, told, values, traced).sampled()
 
 
 class _Call:
@@ -62,14 +62,14 @@ class _Call:
     """
 
     def __init__(
-        self, scene: Scene, grid: Grid, request: Request, layers: int, uniform: bool, values: Any, traced: bool
+        self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool
     ):
-        self._scene, self._grid, self._layers, self._uniform, self._values = scene, grid, layers, uniform, values
+        self._scene, self._grid, self._layers, self._told, self._values = scene, grid, layers, told, values
         self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)
         self._most = most_breaks(grid, request.capacity) if traced else None
         self._context, kept = Context(engine_of(), np.zeros((), real_of(scene))), 1 if all(scene.opaque) else layers
         cells = 1 if request.uniform else layers * grid.size[0] * grid.size[1]
-        beside = (self._most or 0) * samples_of_break(layers, uniform)
+        beside = (self._most or 0) * told.samples(layers)
         rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
         # Without fixed shapes there is no bound.
         self._rows = rows if traced else (2**31 - 1) // len(scene.parts)
@@ -128,7 +128,7 @@ class _Call:
         scene, grid = self._entered(arrays)
         scene = with_joints(scene, grid)
         sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers))
-        sampled = with_outlines(sampled, scene, grid, uniform=self._uniform, most=self._most)
+        sampled = with_outlines(sampled, scene, grid, self._told, most=self._most)
         return self._results([sampled])[0]
 
     def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
@@ -156,9 +156,8 @@ class _Call:
         scene, grid = joined(views, picture)
         request = self._request
         sampled = scene.joints[0].sampled(picture.size, self._layers, request.triangles, request.uniform)
-        sampled = with_outlines(
-            self._limited(sampled), scene._replace(context=self._context), grid, uniform=self._uniform
-        )
+        here = scene._replace(context=self._context)
+        sampled = with_outlines(self._limited(sampled), here, grid, self._told)
         assert sampled.outlines is not None
         count = len(self._scene.parts)
         tables = [sampled.samples[first : first + count] for first in range(0, len(sampled.samples), count)]

@@ -16,7 +16,7 @@ from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Found
+from rts.outlines.found import Found, Told
 from rts.outlines.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
@@ -96,20 +96,20 @@ class _Broken(NamedTuple):
 class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
-    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], uniform: bool):
+    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], told: Told):
         """Take of each part its sampler, camera, entry and, where triangles tell all, sheets, shared by joint parts."""
-        self._scene, self._grid, self._parts, self._uniform = scene, grid, parts, uniform
+        self._scene, self._grid, self._parts, self._told = scene, grid, parts, told
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree], uniform: bool = False) -> Points:
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree], told: Told) -> Points:
         """The points of a grid.
 
         Args:
             scene: the scene.
             grid: its cells.
             inputs: of each part's proxy, on the host; read where the part has no entry.
-            uniform: whether each part has one colour, so that no samples need tell it.
+            told: what samples have to tell.
         """
         parts, joints = [], {joint.first: joint for joint in scene.joints}
         for index, (part, sampler, entry, part_inputs) in enumerate(
@@ -126,7 +126,7 @@ class Points:
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index)
             parts.append((sampler, camera, entry, sheets))
-        return cls(scene, grid, parts, uniform)
+        return cls(scene, grid, parts, told)
 
     @property
     def entries(self) -> list[Any]:
@@ -160,6 +160,8 @@ class Points:
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
+        if not self._told.motions:
+            part[:] = -1
         for index, known in enumerate(self._parts):
             points, triangles = breaks.points, breaks.triangles
             at = np.flatnonzero(part == index)
@@ -196,11 +198,13 @@ class Points:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
         if count == 1 or stacks is None:
-            # For each break the two last samples, and the two that tell colours, if there are several.
-            inner = np.full_like(breaks.parts, -1) if self._uniform else breaks.parts
-            parts = np.concatenate([breaks.parts, inner], 1)
-            points = np.concatenate([breaks.points, breaks.inner], 1)
-            return breaks, parts, points, breaks.triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
+            # For each break the two last samples, and the two that tell colours.
+            points, triangles = np.concatenate([breaks.points, breaks.inner], 1), breaks.triangles
+            if not self._told.motions:
+                points, triangles = np.roll(points, 2, axis=1), np.roll(triangles, 2, axis=1)
+            one_kind = not (self._told.colors and self._told.motions)
+            parts = np.concatenate([breaks.parts, np.full_like(breaks.parts, -1) if one_kind else breaks.parts], 1)
+            return breaks, parts, points, triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
         parts = np.concatenate([stacks.last, stacks.parts], 1)
         points = np.concatenate([breaks.points, stacks.points], 1)
         triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)

@@ -9,6 +9,7 @@ from functools import partial
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
+from rts.outlines.found import Told
 from rts.outlines.of_scene import with_outlines
 from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
@@ -76,7 +77,8 @@ def sampled_scene(
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window; see `sample`.
 
-    With `one_shader` they serve the shaders of the scene alone, so that cells of one colour may name one sample. With
+    With `one_shader` they serve the shaders of the scene and derivatives in its values alone, so that cells of one
+    colour may name one sample, and samples beside outlines need not tell motions of what is constant. With
     `joins`, parts that are sampled at once have no cells of their own in `Samples`.
     """
     settings = settings.of(scene)
@@ -87,19 +89,19 @@ def sampled_scene(
     given, (scene, grid) = scene, on_the_host(scene, grid)
     if scene.cameras and joins and capacity is None and not settings.fronts:
         scene = with_joints(scene, grid)
+    told = Told.of(given) if one_shader else Told()
     # Inside of one colour nothing depends on where a sample lies.
-    uniform = one_shader and all(part.uniform for part in scene.parts)
-    same, layers = uniform and outlines and settings.layers == 1 and not settings.fronts, settings.layers
+    same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
     request = Request(capacity, triangles=outlines or settings.fronts, uniform=same)
     sampled = None
     if outlines and joins and layers != "auto" and not settings.fronts:
-        sampled = sampled_by_one_call(scene, grid, request, layers, uniform)
+        sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=settings.apron)
     taken = partial(sampled_parts, scene, grid, request)
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
         triangle = sampled.triangle if settings.fronts else None
-        sampled = with_outlines(sampled, scene, grid, capacity, uniform).replace(triangle=triangle)
+        sampled = with_outlines(sampled, scene, grid, told, capacity).replace(triangle=triangle)
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
     return in_engine(sampled, given) if scene.cameras else sampled

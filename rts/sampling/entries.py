@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import CONSTANT_TYPES, engine_of, stopped, value_of
+from rts.arrays.engines import CONSTANT_TYPES, engine_of, is_constant, stopped, value_of
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
@@ -24,6 +24,19 @@ def is_known(scene: Scene, grid: Grid) -> bool:
         if value is None or value.ndim != len(shape):
             return False
     return True
+
+
+def is_still(scene: Scene) -> bool:
+    """True if all is constant that tells where samples lie, beside values that are not: no derivative moves samples.
+
+    False for an engine without derivatives. Its images are to the bit those of samples that `rts.sample` gives.
+    """
+    if not scene.context.engine.differentiates:
+        return False
+    return is_constant((scene.camera, [part.transform for part in scene.parts])) and all(
+        is_constant(part.read) or (isinstance(part.surface, TriangleSurface) and is_constant(proxy_inputs(part)))
+        for part in scene.parts
+    )
 
 
 def is_batched(x: Array) -> bool:

@@ -11,6 +11,7 @@ from rts.arrays.engines import Context, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Cells, Outlines, Sampled, Samples
+from rts.outlines.found import Told
 from rts.outlines.of_scene import with_outlines
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, real_of
@@ -25,12 +26,12 @@ def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSet
     scene, grid = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
-    outlines, layers, uniform = settings.finds_outlines, settings.most_layers, all(part.uniform for part in scene.parts)
-    same = uniform and outlines and layers == 1 and not settings.fronts
+    outlines, layers, told = settings.finds_outlines, settings.most_layers, Told.of(*(view.scene for view in views))
+    same = not told.colors and outlines and layers == 1 and not settings.fronts
     sampled = scene.joints[0].sampled(picture.size, layers, outlines, same)
     if outlines:
         here = Context(engine_of(), np.zeros((), real_of(scene)))
-        sampled = with_outlines(sampled, scene._replace(context=here), grid, uniform=uniform)
+        sampled = with_outlines(sampled, scene._replace(context=here), grid, told)
     sampled = in_engine(sampled, scene)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
     return _by_place(sampled, picture, [len(view.proxies) for view in views])

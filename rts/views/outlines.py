@@ -9,7 +9,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
-from rts.outlines.found import Found
+from rts.outlines.found import Found, Told
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_scene import real_of
 from rts.outlines.points import Points, at_centres, found_in_views
@@ -28,10 +28,10 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     sampled, picture, scenes = views.sampled, views.picture, sampling.scenes
     assert views.counts is not None
     grids = sampling.grids
-    uniform, none = all(part.uniform for part in scenes[0].parts), [None] * len(scenes[0].parts)
-    first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]), uniform)
+    told, none = Told.of(*scenes), [None] * len(scenes[0].parts)
+    first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]), told)
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
-    points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, none, uniform), further)]
+    points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, none, told), further)]
     centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)

@@ -1,0 +1,109 @@
+"""Scenes in which nothing moves: samples beside outlines tell colours alone, and there are half as many."""
+
+import numpy as np
+import pytest
+from helpers import icosphere
+
+import rts
+
+torch = pytest.importorskip("torch")
+
+pytestmark = pytest.mark.splatting
+
+SIZE = (32, 32)
+CAMERA = rts.Camera.look_at((0.3, 0.5, 3), (0, 0, 0), fov_y=40)
+CAMERAS = [CAMERA, rts.Camera.look_at((-1, 0.2, 3), (0, 0, 0), fov_y=40)]
+VERTICES, FACES = icosphere(2, 0.7)
+
+
+class Counted(rts.Shader):
+    """Colours that change along x and with the normal, and the number of samples shaded so far."""
+
+    opaque, takes_views = True, True
+    reads = ("normal", "tint")
+
+    def __init__(self):
+        self.rows = 0
+
+    def __call__(self, theta, gbuffer, camera):
+        shade = 1.5 + gbuffer["position"][:, :1] + 0.5 * gbuffer["normal"][:, 1:2]
+        self.rows += shade.shape[0]
+        xp = rts.namespace(shade)
+        color = shade * theta["tint"] if "tint" in theta else xp.concat([shade] * 3, axis=1)
+        xp = rts.namespace(color)
+        return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
+
+
+def ball(theta, points):
+    return (points * points).sum(-1) ** 0.5 - theta["radius"]
+
+
+def rows_and_gradient(kind, geometry, draw):
+    """The number of shaded samples, the images, and their gradient in a tint; `geometry` makes the arrays of shapes."""
+    tint = torch.tensor([0.2, 0.5, 0.7], requires_grad=True)
+    shader = Counted()
+    near = geometry((VERTICES * 0.6 + [0.3, 0.2, 0.9]).astype(np.float32))
+    second = rts.Part(rts.Mesh(FACES), {"vertices": near, "tint": tint}, shader)
+    if kind == "mesh":
+        first = rts.Part(rts.Mesh(FACES), {"vertices": geometry(VERTICES), "tint": tint}, shader)
+    else:
+        first = rts.Part(rts.Sdf(ball, 1.0), {"radius": geometry(np.float32(0.7))}, shader)
+    images = draw([first, second])
+    weights = torch.as_tensor(np.random.default_rng(0).random(images.shape), dtype=images.dtype)
+    (images * weights).sum().backward()
+    return shader.rows, images.detach().numpy(), tint.grad.numpy()
+
+
+@pytest.mark.parametrize("kind", ["mesh", "sdf"])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda parts: rts.render(parts, CAMERA, SIZE),
+        lambda parts: rts.render(parts, CAMERA, SIZE, supersample=2),
+        lambda parts: rts.render_views(parts, CAMERAS, SIZE),
+    ],
+)
+def test_where_nothing_moves_colours_alone_are_told(kind, draw):
+    still, image, slopes = rows_and_gradient(kind, np.asarray, draw)
+    moving, same_image, same_slopes = rows_and_gradient(kind, torch.as_tensor, draw)
+    assert still < moving
+    np.testing.assert_allclose(image, same_image, atol=2e-5)
+    np.testing.assert_allclose(slopes, same_slopes, rtol=1e-5)
+
+
+def test_half_of_the_samples_beside_outlines_are_left():
+    def rows(geometry):
+        return rows_and_gradient("mesh", geometry, lambda parts: rts.render(parts, CAMERA, SIZE))[0]
+
+    part = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES}, "normals")
+    near = part.replace(theta={"vertices": (VERTICES * 0.6 + [0.3, 0.2, 0.9]).astype(np.float32)})
+    sampled = rts.sample([part, near], CAMERA, SIZE)
+    seen = [np.count_nonzero(np.asarray(x) >= 0) for x in (sampled.row, sampled.outlines.rows, sampled.outlines.inner)]
+    assert rows(torch.as_tensor) == sum(seen)
+    assert rows(np.asarray) == seen[0] + seen[2]
+
+
+def test_samples_that_are_kept_tell_motions():
+    """`rts.sample` does not know what will move."""
+    part = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES}, "lambert")
+    sampled = rts.sample(part, CAMERA, SIZE)
+    pose = torch.zeros(6, requires_grad=True)
+    rts.render_samples(sampled, part.replace(transform=rts.rigid(pose)), CAMERA)[..., 3].mean(0)[0:10].sum().backward()
+    assert np.abs(pose.grad[3].numpy()) > 0.01
+
+
+def test_a_program_whose_tint_is_traced_tells_colours_alone():
+    jax = pytest.importorskip("jax")
+    rows = []
+
+    def image(tint, vertices):
+        shader = Counted()
+        drawn = rts.render(rts.Part(rts.Mesh(FACES), {"vertices": vertices, "tint": tint}, shader), CAMERA, SIZE)
+        rows.append(shader.rows)
+        return drawn
+
+    tint = jax.numpy.asarray([0.2, 0.5, 0.7])
+    still = jax.jit(lambda t: image(t, VERTICES))(tint)
+    moving = jax.jit(image)(tint, VERTICES)
+    np.testing.assert_allclose(still, moving, atol=2e-5)
+    assert rows[0] < rows[1]
