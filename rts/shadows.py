@@ -20,7 +20,8 @@ from rts.contracts.checks import check_size, is_count
 from rts.errors import InputError
 from rts.operations.unit import unit
 from rts.rendering.arguments import Layers, SamplerLike
-from rts.rendering.samples import sample
+from rts.rendering.samples import sampled_scene
+from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
@@ -83,25 +84,22 @@ def _picture(
     parts: Sequence[Part], camera: Camera, size: tuple[int, int], sampler: Any, layers: Any, capacity: Any, engine: Any
 ) -> Picture:
     """The picture of parts that have one number of layers."""
-    sampled = sample(
-        parts, camera, size, sampler=sampler, splatter=None, layers=layers, capacity=capacity, engine=engine
-    )
     scene = Scene.of(parts, camera, sampler, engine).at(size)
+    sampled = sampled_scene(scene, scene.camera, size, RenderSettings(None, layers, 1, capacity), one_shader=False)
     opaque, context = all(scene.opaque), scene.context
-    if opaque and sampled.depth is not None and not context.engine.differentiates:
+    if opaque and not context.engine.differentiates:
         depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
-        number = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
         # Nothing moves, so that one sample stands for all.
-        samples = context.engine.constant(np.zeros((1, 3)), depth)
-        return picture_of(depth.reshape(-1), samples, np.where(row >= 0, number, -1), place, size, opaque)
+        return picture_of(depth, context.engine.constant(np.zeros((1, 3)), depth), row, place, size, opaque)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
     positions, row, engine = splats.positions, splats.row, engine_of(splats.positions)
-    place = constants(scene.camera, engine, positions)
+    depth, place = constants((stopped(sampled.depth), scene.camera), engine, positions)
     if not positions.shape[0]:
         positions = constants(np.zeros((1, 3)), engine, positions)
     xp = namespace(positions)
     samples = positions if opaque else xp.concat([positions[:, :2], splats.rgba[:, -1:]], axis=1)
-    return picture_of(stopped(positions)[:, 2], samples, row, place, size, opaque)
+    depth = xp.astype(depth, positions.dtype, copy=False)
+    return picture_of(depth, samples, row, place, size, opaque)
 
 
 def _without_shadow(part: Part) -> Part:

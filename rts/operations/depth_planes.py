@@ -19,8 +19,8 @@ def depth_planes(depth: Array, row: Array, lens: Array) -> Array:
     the slopes times the point's x and y, the surface's plane is not in front of it. The result has no derivative.
 
     Args:
-        depth: (N,) linear depth of samples, N > 0.
-        row: (H, W) the sample in each cell, or −1.
+        depth: (H, W) linear depth of the sample in each cell.
+        row: (H, W) the sample in each cell, or −1 for none.
         lens: (5,): a and b, of clip w a + b · depth; the depth that even depths count from; that of the near plane; the
             even depth of a cell's width, times clip w.
     """
@@ -33,9 +33,8 @@ def even_depth(depth: Array, lens: Array) -> Array:
 
 
 def _specification(depth: Array, row: Array, lens: Array) -> Array:
-    xp, there, (height, width) = namespace(depth), row >= 0, row.shape
-    z = xp.take(stopped(depth), xp.reshape(xp.clip(row, 0, None), (-1,)))
-    z = xp.where(there, xp.reshape(z, (height, width)), lens[2])
+    xp, there = namespace(depth), row >= 0
+    z = xp.where(there, stopped(depth), lens[2])
     return _planes(even_depth(z, lens), xp.where(there, lens[4] / (lens[0] + lens[1] * z), 0.0))
 
 
@@ -93,7 +92,7 @@ class _Rise:
 
 
 def _shape(depth: tuple[int, ...], row: tuple[int, ...], lens: tuple[int, ...]) -> tuple[int, ...]:
-    return 9, *row
+    return 9, *depth
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:
@@ -102,5 +101,5 @@ def _loops() -> tuple[Callable, Callable, Callable]:
     return loops.forward, loops.push, loops.pull
 
 
-PLANES = Operation.of_loops("rts.depth_planes", _specification, (1, 2, 1), _shape, _loops)
+PLANES = Operation.of_loops("rts.depth_planes", _specification, (2, 2, 1), _shape, _loops)
 """The operation of `depth_planes`."""

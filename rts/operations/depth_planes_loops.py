@@ -15,9 +15,9 @@ WORK = 30
 
 def forward(depth: np.ndarray, row: np.ndarray, lens: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (9, H, W)."""
-    if not len(depth) or row.max() >= len(depth) or len(lens) != 5:
-        shapes = f"{depth.shape}, rows up to {row.max()} and a lens {lens.shape}"
-        raise InputError(f"a picture has depths {shapes}; expected one for each row, one at least, and a lens (5,)")
+    if depth.shape != row.shape or len(lens) != 5:
+        shapes = f"{depth.shape}, rows {row.shape} and a lens {lens.shape}"
+        raise InputError(f"a picture has depths {shapes}; expected a depth and a row for each cell, and a lens (5,)")
     parallel(_even, len(row), depth, row, lens, out, work=2 * row.size)
     parallel(_forward, len(row), out, work=WORK * row.size)
 
@@ -61,7 +61,7 @@ def _even(start, stop, depth, row, lens, out):
         for x in range(row.shape[1]):
             out[0, y, x], out[1, y, x] = 0, 0
             if row[y, x] >= 0:
-                z = depth[row[y, x]]
+                z = depth[y, x]
                 over = lens[0] + lens[1] * z
                 out[0, y, x], out[1, y, x] = (z - lens[2]) / over, lens[4] / over
 

@@ -109,15 +109,15 @@ def picture_of(
     """The picture of samples in their cells.
 
     Args:
-        depth: (M,) linear depth of samples, without derivative; one at least.
-        samples: see `Picture`; of as many, or one that stands for all.
+        depth: (K, H, W) linear depth of the samples, without derivative.
+        samples: see `Picture`; one may stand for all.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
         camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
         opaque: see `Picture`.
     """
     xp, lens = namespace(depth), _lens(stopped(camera), depth, size)
-    of_layers = [depth_planes(depth, row[k, ...], lens) for k in range(row.shape[0])]
+    of_layers = [depth_planes(depth[k, ...], row[k, ...], lens) for k in range(row.shape[0])]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
     if samples.shape[0] == 1:
         row = xp.clip(row, None, 0)
