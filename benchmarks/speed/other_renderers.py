@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -86,20 +86,24 @@ class DeodrScene(_Fit):
 
     Args:
         task: the task.
+        lit: by a distant light towards this direction, in three channels. Vertices are shaded, and colours interpolated.
     """
 
-    def __init__(self, task: Task):
+    def __init__(self, task: Task, lit: Sequence[float] | None = None):
         from deodr.differentiable_renderer import PerspectiveCamera, Scene3D
         from deodr.triangulated_mesh import ColoredTriMesh
 
-        self.vertices, self.target = task.vertices.astype(np.float64), task.target.astype(np.float64)
+        channels = 1 if lit is None else 3
+        self.vertices = task.vertices.astype(np.float64)
+        self.target = task.target[..., :channels].astype(np.float64)
         # It looks along +z, y down.
         self.camera = PerspectiveCamera(task.side, task.side, FOV, np.zeros(3))
-        self.mesh = ColoredTriMesh(task.faces, self.vertices, colors=np.ones((len(self.vertices), 1)))
+        self.mesh = ColoredTriMesh(task.faces, self.vertices, colors=np.ones((len(self.vertices), channels)))
         self.scene = Scene3D(sigma=SIGMA, integer_pixel_centers=False)
-        self.scene.set_light(None, 1.0)
+        # Its y and z point the other way, and its light is where it shines to.
+        self.scene.set_light(None if lit is None else np.array(lit) * [-1, 1, 1], 1.0 if lit is None else 0.0)
         self.scene.set_mesh(self.mesh)
-        self.scene.set_background_color([0.0])
+        self.scene.set_background_color([0.0] * channels)
         super().__init__()
 
     def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:

@@ -7,7 +7,7 @@ silhouette of 4 × 4 samples a pixel at the zero pose, its gradient in the pose,
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class Task:
         splatter: by which it is rendered.
         cull: of the part.
         reduction: the loss of the differences to the target.
+        entries: further entries of the part's θ.
     """
 
     def __init__(
@@ -49,11 +50,13 @@ class Task:
         splatter: Any = "auto",
         cull: str = "none",
         reduction: rts.Loss = rts.Loss(),  # noqa: B008  (It is a constant.)
+        entries: Mapping[str, Any] | None = None,
     ):
         self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
         self.layers, self.splatter, self.reduction = layers, splatter, reduction
         self.size, self.view = (side, side), camera()
-        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader, cull=cull)
+        theta = {"vertices": vertices, **(entries or {})}
+        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), theta, shader, cull=cull)
         self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
         self.target = self._target()
 
@@ -71,7 +74,7 @@ class Task:
     def posed(self, pose: Any, vertices: Any = None) -> rts.Part:
         """The part at a pose (6,); its vertices replaced if others are given."""
         part = self.part.replace(transform=rts.rigid(pose))
-        return part if vertices is None else part.replace(theta={"vertices": vertices})
+        return part if vertices is None else part.replace(theta={**part.theta, "vertices": vertices})
 
     def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
         """Mean loss of the differences."""

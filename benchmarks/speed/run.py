@@ -21,7 +21,7 @@ from pathlib import Path
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from benchmarks.meshes import MESHES, kept_mesh
-from benchmarks.speed import levenberg_marquardt, memory, stages, tables
+from benchmarks.speed import levenberg_marquardt, memory, shaded, stages, tables
 from benchmarks.speed.charts import CHARTS
 from benchmarks.speed.pose_iteration import ENGINES, MODES, Task, torch_iteration
 from benchmarks.timing import ROUNDS, WARM_UP, in_turn
@@ -82,6 +82,10 @@ class Plan:
             "pose": (
                 len(every) * count * (rounds + WARM_UP),
                 lambda: pose_rows(self.tasks(every), args, done),
+            ),
+            "shaded": (
+                len(every) * count * (rounds + WARM_UP),
+                lambda: shaded.measure(self.tasks(every), rounds, args.peers, done, BUDGET),
             ),
             "stages": (
                 len(staged) * count * len(stages.KINDS),

@@ -62,6 +62,16 @@ def cell(row: dict, method: str) -> str:
     return f"{number(found['ms'])} ({number(found['low'])}–{number(found['high'])}{fewer})"
 
 
+def shaded(rows: list[dict]) -> str:
+    """Methods down, meshes across, for each size."""
+    text = []
+    for side, found in by_side(rows):
+        header = [f"{side}², shaded, ms", *(f"{row['faces']:,}" for row in found)]
+        methods = dict.fromkeys(name for row in found for name in row["times"])
+        text.append(table(header, ([m, *(cell(row, m) for row in found)] for m in methods)))
+    return "\n".join(text)
+
+
 def stages(rows: list[dict]) -> str:
     header = ["mesh, side", "mode, sampler", "prepare, once", *STAGES, "total"]
     lines = (
@@ -111,6 +121,12 @@ SECTIONS = {
         "DEODR draws one channel of front faces on one thread, by its own classes, which always give the gradient of "
         "the vertices, or called at its compiled functions; the others use all cores.",
         pose,
+    ),
+    "shaded": (
+        "Shaded scenes",
+        "The pose iteration as above, vertices constant, with colours: of a light, four channels; of a texture of 256². "
+        "DEODR shades vertices, three channels.",
+        shaded,
     ),
     "stages": (
         "Stages",
