@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
-from rts.plugin_api.arrays import Array, Tree, exemplar
+from rts.plugin_api.arrays import Array, Tree, exemplar, shape_of
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
@@ -76,6 +76,13 @@ class Mesh(TriangleSurface):
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"
 
+    @property
+    def indices(self) -> dict[str, np.ndarray | None]:
+        """Attribute name → its table (T, 3), read-only, or None for one row a vertex: of all that were declared."""
+        declared = [name for name, column in self._columns.items() if column or name not in VERTEX_ATTRIBUTES]
+        columns = {name: self._columns[name] for name in declared}
+        return {name: self._tables[column // 3] if column else None for name, column in columns.items()}
+
     @classmethod
     def example(cls) -> Part:
         """A coloured icosahedron."""
@@ -94,7 +101,14 @@ class Mesh(TriangleSurface):
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ that lacks an entry of `reads`, or has one of wrong shape or dtype."""
         for name in self.reads(theta):
-            check_rows("a mesh", theta, name, self._extents[self._columns.get(name, 0) // 3])
+            column = self._columns.get(name, 0)
+            check_rows("a mesh", theta, name, self._extents[column // 3])
+            rows, vertices = shape_of(theta[name])[0], shape_of(theta["vertices"])[0]
+            if column == 0 and rows > vertices:
+                raise InputError(
+                    f"theta[{name!r}] of a mesh has {rows} rows, and there are {vertices} vertices; expected one row a "
+                    f"vertex, or Mesh(faces, indices={{{name!r}: table}}), as the surfaces that rts.load makes have"
+                )
 
     def _attributes(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         return self.reads(theta)[1:]

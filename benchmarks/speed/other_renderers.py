@@ -86,7 +86,7 @@ class DeodrScene(_Fit):
 
     Args:
         task: the task.
-        lit: by a distant light towards this direction, in three channels. Vertices are shaded, and colours interpolated.
+        lit: by a distant light towards this direction, in three channels. Vertices are shaded.
     """
 
     def __init__(self, task: Task, lit: Sequence[float] | None = None):

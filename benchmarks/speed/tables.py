@@ -124,8 +124,8 @@ SECTIONS = {
     ),
     "shaded": (
         "Shaded scenes",
-        "The pose iteration as above, vertices constant, with colours: of a light, four channels; of a texture of 256². "
-        "DEODR shades vertices, three channels.",
+        "The pose iteration as above, vertices constant, with colours: of a light, four channels; of a texture of "
+        "256². DEODR shades vertices, three channels.",
         shaded,
     ),
     "stages": (

@@ -217,7 +217,7 @@ class Outlines:
         points: (B, 2) float64, the places of these samples along the gap.
         inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
             colours: in the last hair before an outline normals may turn away, and colours with them. All are −1 where
-            each part has one colour; and where nothing moves, so that `rows` may hold these samples.
+            each part has one colour; and where nothing moves, since `rows` and `points` are then those of colours.
         pair: (B, 2) int32, indices of two samples on the ray of the last sample of the surface that ends, beside its
             deepest point, or −1: the break moves as their mean (`RaySurface.deepest`). A single sample does not tell
             how a kink of a field moves.

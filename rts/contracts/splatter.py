@@ -99,7 +99,7 @@ class SummingSplatter(Splatter):
         """
 
 
-def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
+def _checked_splats(positions: Any, rgba: Any, row: Any, border: int) -> Splats:
     """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
     floats = from_numbers(positions, "positions"), from_numbers(rgba, "rgba")
     row = np.asarray(from_numbers(row, "row"), np.int32) if isinstance(row, (list, tuple)) else from_numbers(row, "row")

@@ -140,7 +140,7 @@ def check_gradient(
     check_flag("hessian", hessian)
     if not (progress is None or isinstance(progress, bool)):
         raise InputError(f"progress is {quoted(progress)}; expected True, False, or None for where there is a terminal")
-    known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
+    known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size", "outputs")]
     if unknown := [name for name in options if name not in known]:
         raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
     own_loss = loss is not None

@@ -10,7 +10,7 @@ import numpy as np
 from rts.arrays.array_functions import kind_of
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_of, is_constant
-from rts.arrays.trees import Array, Tree, leaves
+from rts.arrays.trees import Array, Tree, leaves, placed_leaves
 from rts.errors import EngineError, InputError
 from rts.fitting.parameter_names import names_in_words
 
@@ -42,8 +42,13 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
             engine_of(x)
         except EngineError:
             raise InputError(f"parameters holds {kind_of(x)}; expected torch or jax arrays{purpose}") from None
-    if not arrays or any(is_constant(x) for x in arrays):
-        raise InputError(f"parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays{purpose}")
+    if not arrays:
+        raise InputError(f"parameters holds nothing; expected torch or jax arrays{purpose}")
+    for place, x in placed_leaves(parameters):
+        if is_constant(x):
+            name = "".join(f"[{key!r}]" for key in place)
+            hint = "such as torch.tensor(x) of it"
+            raise InputError(f"parameters{name} is {kind_of(x)}; expected torch or jax arrays{purpose}, {hint}")
     engine = engine_of(parameters)
     for x in arrays:
         if not engine.namespace.isdtype(x.dtype, "real floating"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, shape_of
@@ -109,9 +109,6 @@ class Loss:
     Raises:
         InputError: another name, or a scale that is no number from 1e-10 to 1e10.
     """
-
-    FAR: ClassVar[float] = FAR
-    LEAST_SHARE: ClassVar[float] = LEAST_SHARE
 
     name: str = "linear"
     f_scale: float = 0.1

@@ -16,6 +16,8 @@ from rts.fitting.schedule import box_filtered
 
 LARGEST = 2.0
 """Largest number to expect in a picture from 0 to 1 that was filtered or interpolated."""
+BRIGHTEST = 64.0
+"""Brightest colour to expect of lights, where white is 1."""
 ZERO_UNMEASURED = ("depth", "normal")
 """Outputs of which a target of 0 is not measured."""
 NOT_MEASURED = "; put 0 where nothing was measured"
@@ -165,16 +167,16 @@ def check_range(target: Array, count: int, channels: int, name: str = "target") 
         InputError: an alpha above 2.
 
     Warns:
-        InputWarning: a colour above 2.
+        InputWarning: a colour that no light explains.
     """
     alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
     most = 0.0 if alpha is None else largest(alpha)
     if most > LARGEST:
         raise InputError(f"{name}'s alpha goes up to {most:g}; expected 0 to 1: divide one from 0 to 255 by 255")
-    if channels == 3 and count > 1 and (most := largest(target[..., :3])) > LARGEST:
+    if channels == 3 and count > 1 and (most := largest(target[..., :3])) > BRIGHTEST:
         warn(
-            f"{name}'s colours go up to {most:g}, and those of shaders from 0 to 1: divide a picture from 0 to 255 by "
-            f"255, or let rts.load_image read it",
+            f"{name}'s colours go up to {most:g}, where white is 1: divide a picture from 0 to 255 by 255, or let "
+            f"rts.load_image read it",
             InputWarning,
         )
 

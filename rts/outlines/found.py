@@ -19,9 +19,9 @@ class Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 6) int32, for each break the two last samples, the two that tell colours (−1 where `Told` is of one
-            kind), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last samples, and those of
-            the stack there.
+        rows: (B, 6) int32, for each break the two samples that tell motions, the two that tell colours (−1 if only one
+            of both is told, see `Told`), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last
+            samples, and those of the stack there.
         parts: of the shape of `rows`, int32, their parts, or −1.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
         places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
@@ -82,11 +82,11 @@ _shared_of = attrgetter(*_SHARED)
 
 
 class Told(NamedTuple):
-    """What samples beside breaks have to tell. Two of one layer do if it is of one kind, else there are four.
+    """What samples beside a break have to tell. Of one layer two samples tell either, four tell both.
 
     Attributes:
         colors: False if each part has one colour, which any of its samples tells.
-        motions: False if all is constant that moves samples, and colours are to be told.
+        motions: False if nothing moves (`is_still`) and colours are to be told.
     """
 
     colors: bool = True
@@ -94,7 +94,7 @@ class Told(NamedTuple):
 
     @classmethod
     def of(cls, *scenes: Scene) -> Told:
-        """What the shaders of scenes, and derivatives in their values, have to be told."""
+        """What shaders of scenes, and derivatives in their values, have to be told; of one colour always motions."""
         uniform = all(part.uniform for scene in scenes for part in scene.parts)
         return cls(not uniform, uniform or not all(map(is_still, scenes)))
 

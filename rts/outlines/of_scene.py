@@ -42,7 +42,7 @@ def with_outlines(
         sampled: the samples at centres.
         scene: the scene.
         grid: the cells.
-        told: what samples beside breaks have to tell: where it is of one kind, `Outlines.inner` is −1.
+        told: what samples beside breaks have to tell.
         capacity: `Request.capacity`. Where values are traced, there is room for `most_breaks`, or for fewer if a shared
             table has no room for their samples. `overflow` counts those beyond.
         most: the most breaks to find where values are known; None for all.

@@ -61,9 +61,7 @@ class _Call:
     Args are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
     """
 
-    def __init__(
-        self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool
-    ):
+    def __init__(self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool):
         self._scene, self._grid, self._layers, self._told, self._values = scene, grid, layers, told, values
         self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)
         self._most = most_breaks(grid, request.capacity) if traced else None
@@ -127,7 +125,7 @@ class _Call:
         """The results of one item."""
         scene, grid = self._entered(arrays)
         scene = with_joints(scene, grid)
-        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers))
+        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers, hidden=False))
         sampled = with_outlines(sampled, scene, grid, self._told, most=self._most)
         return self._results([sampled])[0]
 

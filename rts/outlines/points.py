@@ -198,9 +198,9 @@ class Points:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
         if count == 1 or stacks is None:
-            # For each break the two last samples, and the two that tell colours.
+            # For each break the two last samples, which tell motions, and the two that tell colours.
             points, triangles = np.concatenate([breaks.points, breaks.inner], 1), breaks.triangles
-            if not self._told.motions:
+            if not self._told.motions:  # Those that tell colours come first, and are alone.
                 points, triangles = np.roll(points, 2, axis=1), np.roll(triangles, 2, axis=1)
             one_kind = not (self._told.colors and self._told.motions)
             parts = np.concatenate([breaks.parts, np.full_like(breaks.parts, -1) if one_kind else breaks.parts], 1)

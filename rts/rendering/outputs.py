@@ -213,6 +213,6 @@ def _front_depth(splats: Splats) -> Array:
 def _unknown(name: str, gbuffer: GBuffer) -> str:
     """The error of an output that a surface does not give."""
     names = ["color", "alpha", *MEANS, *FRONTS, *gbuffer]
-    close = difflib.get_close_matches(name, names, n=1)
+    close = ["alpha"] if name == "mask" else difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else f"; expected some of {', '.join(dict.fromkeys(names))}"
     return f"outputs has {name!r}, which is neither an output nor an attribute of the surface{hint}"

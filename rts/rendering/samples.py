@@ -98,7 +98,7 @@ def sampled_scene(
         sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=settings.apron)
-    taken = partial(sampled_parts, scene, grid, request)
+    taken = partial(sampled_parts, scene, grid, request, hidden=not outlines)
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
         triangle = sampled.triangle if settings.fronts else None

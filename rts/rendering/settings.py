@@ -10,7 +10,7 @@ from typing import Any, Literal
 from rts.contracts.checks import check_size, check_splatter, is_auto
 from rts.contracts.splatter import Splatter
 from rts.plugin_base import promised
-from rts.sampling.layer_count import TRACED_LAYERS, planned
+from rts.sampling.layer_count import TRACED_LAYERS
 from rts.sampling.scene import Scene
 
 BAND = 2**20
@@ -76,8 +76,8 @@ class RenderSettings:
 
     @property
     def most_layers(self) -> int:
-        """The number of layers to plan for; with "auto" an estimate."""
-        return planned(self.layers)
+        """The number of layers to plan memory for; with "auto" that of traced values."""
+        return TRACED_LAYERS[False] if self.layers == "auto" else self.layers
 
     @property
     def apron(self) -> int:

@@ -12,7 +12,7 @@ from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
-from rts.sampling.scene import Grid, Scene
+from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -27,16 +27,15 @@ def is_known(scene: Scene, grid: Grid) -> bool:
 
 
 def is_still(scene: Scene) -> bool:
-    """True if all is constant that tells where samples lie, beside values that are not: no derivative moves samples.
+    """True if no derivative moves samples: all lie on triangles, and surfaces, transforms and camera are constant.
 
-    False for an engine without derivatives. Its images are to the bit those of samples that `rts.sample` gives.
+    Such surfaces are evaluated where they are sampled, so that what a function of theirs closes over has no derivative
+    either. False for an engine without derivatives, by which `render` and `render_samples` of `sample` are equal to the
+    bit.
     """
-    if not scene.context.engine.differentiates:
+    if not scene.context.engine.differentiates or not all(map(has_sheets, scene.parts, scene.samplers)):
         return False
-    return is_constant((scene.camera, [part.transform for part in scene.parts])) and all(
-        is_constant(part.read) or (isinstance(part.surface, TriangleSurface) and is_constant(proxy_inputs(part)))
-        for part in scene.parts
-    )
+    return is_constant((scene.camera, scene.read, [part.transform for part in scene.parts]))
 
 
 def is_batched(x: Array) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -18,13 +17,8 @@ TRACED_LAYERS = {True: 2, False: 4}
 """The number of layers that it takes where values are traced, if all is opaque, or not."""
 
 
-def planned(layers: int | Literal["auto"]) -> int:
-    """The number of layers to plan memory for: K, or that of traced values while "auto" has not found one."""
-    return TRACED_LAYERS[False] if layers == "auto" else int(layers)
-
-
 def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
-    """A scene sampled with as many layers as it has, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
+    """A scene sampled with all layers that `taken` gives, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
 
     Traced values cannot decide; the number is then of `TRACED_LAYERS`.
 

@@ -9,29 +9,81 @@ from functools import partial
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples
 from rts.errors import InputError
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene
+from rts.sampling.tables import taken_rows
 
 
-def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int) -> Sampled:
-    """The samples of all parts at the centres of a grid of cells."""
+def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, hidden: bool = True) -> Sampled:
+    """The samples of all parts at the centres of a grid of cells.
+
+    Without `hidden`, those that are known to lie behind opaque ones are left out.
+    """
     tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
+    of_parts = [1 if opaque and not hidden else layers for opaque in scene.opaque]
     while number < len(scene.parts):
         joint = joints.get(number)
         if joint is not None:
-            tables.append(joint.sampled(grid.size, layers, request.triangles, request.uniform))
+            most = max(of_parts[number : joint.stop])
+            tables.append(joint.sampled(grid.size, most, request.triangles, request.uniform))
             number = joint.stop
             continue
         part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
         camera = scene.local_camera(number, grid)
-        sampled = sampler.sample(part, camera, grid.size, layers, replace(request, entry=entry))
+        sampled = sampler.sample(part, camera, grid.size, of_parts[number], replace(request, entry=entry))
         tables.append(check_samples(sampled, grid.size, sampler))
         number += 1
-    return merge(tables, layers)
+    merged = merge(tables, layers)
+    return merged if hidden or not any(scene.opaque) or len(merged.row) == 1 else _without_hidden(merged, scene.opaque)
+
+
+def _without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
+    """Samples without those behind `opaque` parts, where they are known; engines that pad keep their rows, unused."""
+    row, engine = sampled.row, engine_of(sampled.row)
+    known, part = value_of(row), value_of(sampled.part)
+    if known is None or part is None or known.ndim != row.ndim:
+        return sampled
+    blocks = (part >= 0) & np.array(opaque)[part]
+    reached = (known >= 0) & (np.cumsum(blocks, axis=0) - blocks == 0)
+    if reached.sum() == (known >= 0).sum():
+        return sampled
+    used = np.zeros(sum(one.ids.shape[0] for one in sampled.samples), np.bool_)
+    used[known[reached]] = True
+    samples, place, first, start = [], np.full(len(used) + 1, -1, np.int32), 0, 0
+    for one in sampled.samples:
+        count = one.ids.shape[0]
+        seen = used[first : first + count]
+        # A part that nobody sees has one unused row.
+        index = np.arange(count) if engine.padded(row) else np.flatnonzero(seen if seen.any() else np.arange(count) < 1)
+        own = np.full(count + 1, -1, np.int32)
+        own[index] = np.where(seen[index], np.arange(len(index)), -1)
+        place[first : first + count] = own[:-1] + start * (own[:-1] >= 0)
+        samples.append(_with_rows(one, index, own))
+        first, start = first + count, start + len(index)
+
+    def masked(x: Array | None, empty: int) -> Array | None:
+        values = None if x is None else value_of(x)
+        return x if values is None else engine.constant(np.where(reached, values, values.dtype.type(empty)), x)
+
+    moved = engine.constant(np.where(reached, place[known], np.int32(-1)), row)
+    return replace(
+        sampled, samples=tuple(samples), cells=Cells(moved, masked(sampled.depth, 0), masked(sampled.triangle, -1))
+    )
+
+
+def _with_rows(samples: Samples, index: np.ndarray, place: np.ndarray) -> Samples:
+    """The rows of samples with some indices; `place` (N + 1,) has the new one of each row, and of −1, or −1."""
+    engine, count, row = engine_of(samples.ids), samples.ids.shape[0], value_of(samples.row)
+    assert row is not None
+    if row.shape[-2:] == (1, count):  # No cells of its own, but a row for each sample.
+        row = row[..., index]
+    if len(index) < count:
+        samples = taken_rows(samples, engine.constant(index.astype(np.int32), samples.ids))
+    return samples.replace(row=engine.constant(place[row], samples.row))
 
 
 def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:

@@ -110,7 +110,7 @@ def picture_of(
 
     Args:
         depth: (K, H, W) linear depth of the samples, without derivative.
-        samples: see `Picture`; one may stand for all.
+        samples: see `Picture`; one row may stand for all.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
         camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
@@ -127,7 +127,7 @@ def picture_of(
 def _lens(camera: Camera, depth: Array, size: tuple[int, int]) -> Array:
     """See `depth_planes`; even depths count from the farthest sample."""
     xp, p, (near, _) = namespace(depth), camera.projection, camera.depth_range()
-    origin = xp.clip(xp.max(depth), near, None)  # Rows that are not used may hold a depth of 0.
+    origin = xp.clip(xp.max(depth), near, None)  # Empty cells have a depth of 0.
     width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
     lens = p[3, 3], -p[3, 2], origin, near, width * (p[3, 3] - p[3, 2] * origin)
     return xp.astype(xp.stack(lens), depth.dtype, copy=False)

@@ -226,10 +226,10 @@ def _upload(context: moderngl.Context, prepared: Buffers) -> Any:
 
 def _forget(context: moderngl.Context, device: Device) -> None:
     if device.context is context:
-        _release(context, device.objects)
+        _release(device.objects)
 
 
-def _release(context: moderngl.Context, objects: Sequence[Any]) -> None:
+def _release(objects: Sequence[Any]) -> None:
     for item in objects:
         item.release()
 
@@ -250,7 +250,7 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
             )
         while len(kept) >= TARGETS:
             for framebuffer, texture, depth in kept.pop(next(iter(kept))):
-                _release(context, [framebuffer, texture, depth])
+                _release([framebuffer, texture, depth])
         pairs, objects = [], []
         try:
             for _ in range(2):
@@ -259,7 +259,7 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
                 objects.append(framebuffer := context.framebuffer([texture], depth))
                 pairs.append((framebuffer, texture, depth))
         except BaseException:
-            _release(context, objects[::-1])
+            _release(objects[::-1])
             raise
         kept[size] = pairs
     kept[size] = kept.pop(size)  # The least recently used is first.

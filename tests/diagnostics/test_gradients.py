@@ -173,10 +173,12 @@ ALONG = {"color": [0, 0, 0], "shift": [1.0, 0, 0]}
         (lambda p: rts.check_gradient(card, p, SIZE, samples="8"), "samples is '8'; expected an integer"),
         (lambda p: rts.check_gradient(card, p, SIZE, entries=[1]), r"entries is \[1\]; expected an integer"),
         (lambda p: rts.check_gradient(card, p, SIZE, sampels=3), "no option 'sampels'; expected sampler, splatter"),
+        (lambda p: rts.check_gradient(card, p, SIZE, outputs=("depth",)), "no option 'outputs'; expected sampler"),
         (lambda p: rts.check_gradient(card, {"a": p["shift"], 1: p["color"]}, SIZE), "keys that cannot be sorted"),
         (lambda p: rts.gradient_image(None, p, ALONG), "image is None; expected a function"),
         (lambda p: rts.gradient_image(lambda q: np.zeros((3, 3, 3)), p, ALONG), "image gave a numpy.ndarray"),
-        (lambda p: rts.gradient_image(card, None), "parameters holds NumPy arrays, numbers or nothing"),
+        (lambda p: rts.gradient_image(card, None), "parameters holds nothing; expected torch or jax"),
+        (lambda p: rts.gradient_image(card, {"a": [p["shift"], 3.0]}), r"parameters\['a'\]\[1\] is .*; expected torch"),
         (lambda p: rts.gradient_image(card, p, ALONG, scale=np.ones((5, 9))), r"scale is a numpy.ndarray of shape"),
     ],
 )

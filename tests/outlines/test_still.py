@@ -5,6 +5,9 @@ import pytest
 from helpers import icosphere
 
 import rts
+from rts.outlines.found import Told
+from rts.sampling.scene import Scene
+from rts_surfaces.implicit.narrow_band import NarrowBand
 
 torch = pytest.importorskip("torch")
 
@@ -34,8 +37,8 @@ class Counted(rts.Shader):
         return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
 
 
-def ball(theta, points):
-    return (points * points).sum(-1) ** 0.5 - theta["radius"]
+def sphere(theta, points):
+    return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - 0.6
 
 
 def rows_and_gradient(kind, geometry, draw):
@@ -47,14 +50,17 @@ def rows_and_gradient(kind, geometry, draw):
     if kind == "mesh":
         first = rts.Part(rts.Mesh(FACES), {"vertices": geometry(VERTICES), "tint": tint}, shader)
     else:
-        first = rts.Part(rts.Sdf(ball, 1.0), {"radius": geometry(np.float32(0.7))}, shader)
+        axis = np.linspace(-1, 1, 13, dtype=np.float32)
+        values = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+        values = np.linalg.norm(values, axis=-1).astype(np.float32)
+        first = rts.Part(rts.Isosurface(((-1,) * 3, (1,) * 3), 0.7), {"values": geometry(values)}, shader)
     images = draw([first, second])
     weights = torch.as_tensor(np.random.default_rng(0).random(images.shape), dtype=images.dtype)
     (images * weights).sum().backward()
     return shader.rows, images.detach().numpy(), tint.grad.numpy()
 
 
-@pytest.mark.parametrize("kind", ["mesh", "sdf"])
+@pytest.mark.parametrize("kind", ["mesh", "isosurface"])
 @pytest.mark.parametrize(
     "draw",
     [
@@ -90,6 +96,29 @@ def test_samples_that_are_kept_tell_motions():
     pose = torch.zeros(6, requires_grad=True)
     rts.render_samples(sampled, part.replace(transform=rts.rigid(pose)), CAMERA)[..., 3].mean(0)[0:10].sum().backward()
     assert np.abs(pose.grad[3].numpy()) > 0.01
+
+
+BOUNDS = (-1.5,) * 3, (1.5,) * 3
+
+
+@pytest.mark.parametrize(
+    ("surface", "theta"),
+    [
+        (rts.Isosurface(BOUNDS, 0.0, sphere, (9,) * 3, reads=["center"]), {"center": torch.zeros(3)}),
+        # Its lattice is made by NumPy.
+        (
+            rts.Isosurface(BOUNDS, 0.0, sphere, (9,) * 3, reads=["center"], band=NarrowBand()),
+            {"center": torch.zeros(3)},
+        ),
+        # Rays that graze it tell badly where it is, and its function may close over what moves it.
+        (rts.Sdf(sphere, 1.0), {"center": np.zeros(3, np.float32)}),
+        (rts.Mesh(FACES), {"vertices": torch.as_tensor(VERTICES)}),
+    ],
+)
+def test_other_scenes_have_motions_told(surface, theta):
+    still = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES, "color": torch.ones(3)}, "lambert")
+    assert Told.of(Scene.of([still], CAMERA, "auto", None)) == Told(motions=False)
+    assert Told.of(Scene.of([still, rts.Part(surface, theta, "lambert")], CAMERA, "auto", None)) == Told()
 
 
 def test_a_program_whose_tint_is_traced_tells_colours_alone():

@@ -121,7 +121,7 @@ def test_a_shader_that_gives_nan_is_named():
         return gbuffer["position"][:, [0, 1, 2, 2]] * np.nan
 
     with pytest.raises(InputError, match="what the shader .*broken.* returned of part 1 holds NaN"):
-        show([PART, PART.replace(shader=broken)])
+        show([PART.replace(transform=np.diag([0.5, 0.5, 0.5, 1])), PART.replace(shader=broken)])
 
 
 def test_a_surface_that_gives_nan_is_named():

@@ -256,6 +256,28 @@ def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
         np.testing.assert_allclose(np.asarray(pushed_by_jax), derivative, atol=1e-3)
 
 
+@pytest.mark.parametrize("sampler", ["raster", "reference"])
+def test_what_lies_behind_opaque_parts_is_left_out(sampler):
+    """A wall between panes covers the left half of the image; the reference samples part by part."""
+    parts = [pane(EVERYWHERE, 2, RED, 0.3), pane(HALF, 3, GREEN, 1)]
+    parts += [pane(EVERYWHERE if i else HALF, 4 + i, BLUE, 0.5) for i in range(3)]
+    sampled = rts.sample(parts, in_pixels(), SIZE, splatter="edges", sampler=sampler)
+    kept = rts.sample(parts, in_pixels(), SIZE, splatter=None, sampler=sampler)
+    assert (sampled.row.shape[0], kept.row.shape[0]) == (4, 6)
+    part, row = (np.asarray(x) for x in (sampled.part, sampled.row))
+    wall = (part == 1).any(axis=0)
+    assert wall.any() and part[:, wall].max() == 1 and (row[:, ~wall][:3] >= 0).all()
+    # Each row is in use, in order; the pane that just the wall hides has one that is not.
+    cells = sum(np.count_nonzero(part == i) for i in range(5))
+    assert np.array_equal(np.unique(row[row >= 0]).size, cells)
+    assert [samples.ids.shape[0] for samples in sampled.samples][2] < wall.sum() / 4
+    image = drawn(parts, layers="auto", sampler=sampler)
+    np.testing.assert_allclose(image[12, 3], over((RED, 0.3), (GREEN, 1)), atol=1e-5)
+    np.testing.assert_allclose(image[12, 20], over((RED, 0.3), (BLUE, 0.5), (BLUE, 0.5)), atol=1e-5)
+    np.testing.assert_allclose(image, drawn(parts, layers=6, sampler=sampler), atol=1e-6)
+    np.testing.assert_allclose(image, drawn([*parts[:2], *parts[3:]], layers="auto", sampler=sampler), atol=1e-6)
+
+
 def test_layers_that_are_found_are_as_many_as_light_goes():
     """With layers="auto" all panes are composited; with too few of them a warning says so."""
     parts = [pane(EVERYWHERE, 3 + i, np.eye(3)[i % 3], 0.3) for i in range(5)]

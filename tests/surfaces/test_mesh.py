@@ -98,6 +98,23 @@ def heat_in_blue(theta, gbuffer, camera):
     return xp.concat([color[:, :2], gbuffer["heat"], one], axis=1)
 
 
+def test_tables_of_attributes_are_those_that_were_given():
+    _, faces = quad()
+    table = [(1, 0, 0), (1, 1, 1)]
+    mesh = rts.Mesh(faces, {"uv": table, "heat": None, "colors": faces})
+    assert set(mesh.indices) == {"uv", "heat"} and mesh.indices["heat"] is None
+    np.testing.assert_array_equal(mesh.indices["uv"], table)
+    assert set(rts.Mesh(mesh.faces, mesh.indices).indices) == {"uv", "heat"} and rts.Mesh(faces).indices == {}
+
+
+def test_more_rows_than_vertices_want_a_table():
+    part = mesh_part(quad(), theta={"uv": np.zeros((6, 2))})
+    with pytest.raises(
+        rts.InputError, match=r"theta\['uv'\] of a mesh has 6 rows, and there are 4 vertices; .* indices"
+    ):
+        show(part)
+
+
 def test_attributes_of_vertices_need_no_indices_but_their_name():
     part = mesh_part(
         quad(-9, 9, -9, 9),
