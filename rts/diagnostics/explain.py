@@ -13,6 +13,7 @@ from rts.arrays.engines import engine_of
 from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.records import Samples
 from rts.contracts.shader import FunctionShader
+from rts.fitting.targets import BRIGHTEST, largest
 from rts.registry import name_of
 from rts.rendering.arguments import Layers, SplatterLike
 from rts.rendering.image import render_samples
@@ -96,6 +97,10 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
     if is_inside_out(part, camera):
         yield INSIDE_OUT
+    for name in ("texture", "color", "colors"):
+        value = part.theta.get(name)
+        if value is not None and (most := largest(value)) > BRIGHTEST:
+            yield f"theta[{name!r}] goes up to {most:g}, where white is 1: divide colours from 0 to 255 by 255"
     if isinstance(part.shader, FunctionShader) and not hasattr(part.shader.function, "opaque"):
         yield NO_PROMISE
 

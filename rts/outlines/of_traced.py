@@ -125,7 +125,7 @@ class _Call:
         """The results of one item."""
         scene, grid = self._entered(arrays)
         scene = with_joints(scene, grid)
-        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers, hidden=False))
+        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers))
         sampled = with_outlines(sampled, scene, grid, self._told, most=self._most)
         return self._results([sampled])[0]
 

@@ -43,36 +43,32 @@ def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, hidde
 
 def _without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
     """Samples without those behind `opaque` parts, where they are known; engines that pad keep their rows, unused."""
-    row, engine = sampled.row, engine_of(sampled.row)
-    known, part = value_of(row), value_of(sampled.part)
-    if known is None or part is None or known.ndim != row.ndim:
+    from rts.sampling import merging_loops
+
+    engine, row = engine_of(sampled.row), sampled.row
+    known = value_of(row) if engine.on_host(row) else None
+    if known is None or known.ndim != row.ndim:
         return sampled
-    blocks = (part >= 0) & np.array(opaque)[part]
-    reached = (known >= 0) & (np.cumsum(blocks, axis=0) - blocks == 0)
-    if reached.sum() == (known >= 0).sum():
+    counts = [one.ids.shape[0] for one in sampled.samples]
+    reached, used = merging_loops.reached_by_light(known, np.repeat(opaque, counts))
+    if np.array_equal(reached, known >= 0):
         return sampled
-    used = np.zeros(sum(one.ids.shape[0] for one in sampled.samples), np.bool_)
-    used[known[reached]] = True
-    samples, place, first, start = [], np.full(len(used) + 1, -1, np.int32), 0, 0
-    for one in sampled.samples:
-        count = one.ids.shape[0]
+    samples, place, first, start = [], np.full(len(used), -1, np.int32), 0, 0
+    for one, count in zip(sampled.samples, counts, strict=True):
         seen = used[first : first + count]
         # A part that nobody sees has one unused row.
         index = np.arange(count) if engine.padded(row) else np.flatnonzero(seen if seen.any() else np.arange(count) < 1)
         own = np.full(count + 1, -1, np.int32)
         own[index] = np.where(seen[index], np.arange(len(index)), -1)
-        place[first : first + count] = own[:-1] + start * (own[:-1] >= 0)
+        place[first : first + count] = own[:-1] + start
         samples.append(_with_rows(one, index, own))
         first, start = first + count, start + len(index)
-
-    def masked(x: Array | None, empty: int) -> Array | None:
-        values = None if x is None else value_of(x)
-        return x if values is None else engine.constant(np.where(reached, values, values.dtype.type(empty)), x)
-
-    moved = engine.constant(np.where(reached, place[known], np.int32(-1)), row)
-    return replace(
-        sampled, samples=tuple(samples), cells=Cells(moved, masked(sampled.depth, 0), masked(sampled.triangle, -1))
-    )
+    depth, triangle = (None if x is None else value_of(x) for x in (sampled.depth, sampled.triangle))
+    assert depth is not None
+    found = merging_loops.kept(reached, place, known, depth, triangle)
+    of = row, sampled.depth, sampled.triangle
+    cells = Cells(*(engine.constant(x, like) for x, like in zip(found, of, strict=False)))
+    return replace(sampled, samples=tuple(samples), cells=cells)
 
 
 def _with_rows(samples: Samples, index: np.ndarray, place: np.ndarray) -> Samples:

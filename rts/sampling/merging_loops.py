@@ -82,3 +82,60 @@ def _put(index, z, t, y, x, k, row, depth, triangle):
     if len(triangle) > 0:
         triangle[k, y, x] = t
     return k
+
+
+def reached_by_light(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which samples (K, H, W) light reaches, and which rows (N,) these are.
+
+    Args:
+        row: (K, H, W), front to back, or −1.
+        blocks: (N,) bool, whether light ends at a sample.
+    """
+    reached, used = np.empty(row.shape, np.bool_), np.zeros(len(blocks), np.bool_)
+    parallel(_reach, row.shape[1], read_only(row, np.int32), read_only(blocks), reached, used, work=3 * row.size)
+    return reached, used
+
+
+@loop
+def _reach(start, stop, row, blocks, reached, used):
+    """Fill lines of `reached`, and mark rows as `used`."""
+    for y in range(start, stop):
+        for x in range(row.shape[2]):
+            lit = True
+            for k in range(len(row)):
+                n = row[k, y, x]
+                reached[k, y, x] = lit and n >= 0
+                if reached[k, y, x]:
+                    used[n], lit = True, not blocks[n]
+
+
+def kept(
+    reached: np.ndarray, place: np.ndarray, row: np.ndarray, depth: np.ndarray, triangle: np.ndarray | None
+) -> tuple[np.ndarray, ...]:
+    """Row, depth and triangle, if there is one, (K, H, W) of samples that are `reached`, −1 and 0 elsewhere.
+
+    Args:
+        reached: (K, H, W) bool.
+        place: (N,) int32, the new row of each.
+        row: (K, H, W), likewise.
+        depth: (K, H, W), likewise.
+        triangle: (K, H, W), likewise, or None.
+    """
+    triangles = np.empty((0, *row.shape[1:]), np.int32) if triangle is None else triangle
+    known = read_only(row, np.int32), read_only(depth), read_only(triangles, np.int32)
+    results = np.empty(row.shape, np.int32), np.empty(row.shape, depth.dtype), np.empty(triangles.shape, np.int32)
+    parallel(_keep, row.shape[1], reached, read_only(place), *known, *results, work=4 * row.size)
+    return results if triangle is not None else results[:2]
+
+
+@loop
+def _keep(start, stop, reached, place, row, depth, triangle, to_row, to_depth, to_triangle):
+    """Fill lines of the results of `kept`."""
+    for k in range(len(row)):
+        for y in range(start, stop):
+            for x in range(row.shape[2]):
+                there = reached[k, y, x]
+                to_row[k, y, x] = place[row[k, y, x]] if there else -1
+                to_depth[k, y, x] = depth[k, y, x] if there else 0
+            for x in range(row.shape[2] if len(triangle) else 0):
+                to_triangle[k, y, x] = triangle[k, y, x] if reached[k, y, x] else -1

@@ -38,6 +38,14 @@ Mesh = rts.plugin("surfaces", "mesh")
 
 
 @pytest.mark.parametrize("target", ALL)
+def test_colours_from_0_to_255_are_remarked(target):
+    part = arrays(target, mesh_part(quad(), shader="unlit", theta={"color": np.full(3, 200.0)}))
+    (remark,) = rts.explain(part, CAMERA)[0].remarks
+    assert remark.startswith("theta['color'] goes up to 200, where white is 1")
+    assert rts.explain(mesh_part(quad(), shader="unlit", theta={"color": np.full(3, 2.0)}), CAMERA)[0].remarks == ()
+
+
+@pytest.mark.parametrize("target", ALL)
 def test_render_is_sample_then_render_samples(target):
     part, camera = arrays(target, (mesh_part(icosphere(1), shader="lambert"), CAMERA))
     image = show(part, camera, layers=3, background=(0.1, 0.2, 0.3))
