@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
@@ -16,8 +15,8 @@ from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host
 from rts.sampling.joint import with_joints
-from rts.sampling.layer_count import with_all_layers
-from rts.sampling.merging import sampled_parts
+from rts.sampling.layer_count import has_full_stacks, with_all_layers
+from rts.sampling.merging import sampled_parts, without_hidden
 from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
@@ -98,10 +97,21 @@ def sampled_scene(
         sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=settings.apron)
-    taken = partial(sampled_parts, scene, grid, request, hidden=not outlines)
-    sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
-    if outlines:
-        triangle = sampled.triangle if settings.fronts else None
-        sampled = with_outlines(sampled, scene, grid, told, capacity).replace(triangle=triangle)
+
+    def taken(count: int) -> Sampled:
+        if not outlines:
+            return sampled_parts(scene, grid, request, count)
+        # Samples do not spread, so that what lies behind an opaque one has no effect.
+        return without_hidden(sampled_parts(scene, grid, request, count, of_opaque=1), scene.opaque)
+
+    least = 1
+    while True:
+        sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)
+        if outlines:
+            triangle = sampled.triangle if settings.fronts else None
+            sampled = with_outlines(sampled, scene, grid, told, capacity).replace(triangle=triangle)
+        if layers != "auto" or not has_full_stacks(sampled, scene.opaque):
+            break
+        least = 2 * sampled.row.shape[-3]
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
     return in_engine(sampled, given) if scene.cameras else sampled

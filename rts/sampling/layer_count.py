@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +17,8 @@ TRACED_LAYERS = {True: 2, False: 4}
 """The number of layers that it takes where values are traced, if all is opaque, or not."""
 
 
-def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
-    """A scene sampled with all layers that `taken` gives, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
+def with_all_layers(taken: Callable[[int], Sampled], opaque: bool, least: int = 1) -> Sampled:
+    """A scene sampled with all layers of centres of cells, up to `LAYER_LIMIT`; a LayersWarning if these are more.
 
     Traced values cannot decide; the number is then of `TRACED_LAYERS`.
 
@@ -28,8 +28,9 @@ def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
     Args:
         taken: samples the scene with a number of layers.
         opaque: whether all shaders promise to be opaque.
+        least: layers to keep in any case, if the scene has them.
     """
-    count = 3
+    count = max(3, least)
     while True:
         # At the limit one more is taken, to know what is missing there.
         sampled = taken(min(count, LAYER_LIMIT + 1))
@@ -49,8 +50,26 @@ def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
             f'layers="auto"; give a larger number if their derivative matters',
             LayersWarning,
         )
-    cells = sampled.cells.first(min(most + (not opaque), LAYER_LIMIT))
+    cells = sampled.cells.first(min(max(most + (not opaque), least), LAYER_LIMIT))
     return replace(sampled, cells=cells, overflow=sampled.overflow + missing)
+
+
+def has_full_stacks(sampled: Sampled, opaque: Sequence[bool]) -> bool:
+    """True if light passes through the last layer beside some break, so that there may be more layers than are kept.
+
+    Beside the outline of something opaque there may be more than at any centre of a cell.
+
+    Args:
+        sampled: the samples, with outlines.
+        opaque: for each part, whether no light passes through it.
+    """
+    outlines, layers = sampled.outlines, sampled.row.shape[-3]
+    stack = None if outlines is None or outlines.stack is None else value_of(outlines.stack)
+    if stack is None or stack.ndim != 3 or layers >= LAYER_LIMIT:
+        return False
+    last = stack[:, :, -1]
+    passes = ~np.repeat(opaque, [one.ids.shape[-2] for one in sampled.samples])
+    return bool(passes[last[last >= 0]].any())
 
 
 def _may_have_more(sampled: Sampled) -> bool:

@@ -18,17 +18,22 @@ from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import taken_rows
 
 
-def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, hidden: bool = True) -> Sampled:
+def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, of_opaque: int | None = None) -> Sampled:
     """The samples of all parts at the centres of a grid of cells.
 
-    Without `hidden`, those that are known to lie behind opaque ones are left out.
+    Args:
+        scene: the scene.
+        grid: the cells.
+        request: what samplers are asked for.
+        layers: K.
+        of_opaque: the most layers to take of an opaque part; None for K.
     """
     tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
-    of_parts = [1 if opaque and not hidden else layers for opaque in scene.opaque]
+    of_parts = [min(of_opaque or layers, layers) if opaque else layers for opaque in scene.opaque]
     while number < len(scene.parts):
         joint = joints.get(number)
         if joint is not None:
-            most = max(of_parts[number : joint.stop])
+            most = max(of_parts[number : joint.stop])  # They are drawn at once.
             tables.append(joint.sampled(grid.size, most, request.triangles, request.uniform))
             number = joint.stop
             continue
@@ -37,20 +42,28 @@ def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, hidde
         sampled = sampler.sample(part, camera, grid.size, of_parts[number], replace(request, entry=entry))
         tables.append(check_samples(sampled, grid.size, sampler))
         number += 1
-    merged = merge(tables, layers)
-    return merged if hidden or not any(scene.opaque) or len(merged.row) == 1 else _without_hidden(merged, scene.opaque)
+    return merge(tables, layers)
 
 
-def _without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
-    """Samples without those behind `opaque` parts, where they are known; engines that pad keep their rows, unused."""
+def without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
+    """Samples without those that lie behind one of an opaque part in their cell.
+
+    Only values that are known, on the host, tell. Engines that pad keep the rows, and no cell refers to them.
+
+    Args:
+        sampled: the samples.
+        opaque: for each part, whether no light passes through it.
+    """
     from rts.sampling import merging_loops
 
+    if not any(opaque) or len(sampled.row) == 1:
+        return sampled
     engine, row = engine_of(sampled.row), sampled.row
     known = value_of(row) if engine.on_host(row) else None
     if known is None or known.ndim != row.ndim:
         return sampled
     counts = [one.ids.shape[0] for one in sampled.samples]
-    reached, used = merging_loops.reached_by_light(known, np.repeat(opaque, counts))
+    reached, used = merging_loops.seen_along_rays(known, np.repeat(opaque, counts))
     if np.array_equal(reached, known >= 0):
         return sampled
     samples, place, first, start = [], np.full(len(used), -1, np.int32), 0, 0
@@ -72,10 +85,17 @@ def _without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
 
 
 def _with_rows(samples: Samples, index: np.ndarray, place: np.ndarray) -> Samples:
-    """The rows of samples with some indices; `place` (N + 1,) has the new one of each row, and of −1, or −1."""
+    """The rows of samples with some indices.
+
+    Args:
+        samples: the samples of a part.
+        index: the rows to keep.
+        place: (N + 1,), the new index of each old row, or −1 if it is dropped; −1 in last place, which −1 refers to.
+    """
     engine, count, row = engine_of(samples.ids), samples.ids.shape[0], value_of(samples.row)
     assert row is not None
-    if row.shape[-2:] == (1, count):  # No cells of its own, but a row for each sample.
+    # Parts that were sampled at once have a cell for each sample; grids with an apron are taller than a line.
+    if row.shape[-2:] == (1, count):
         row = row[..., index]
     if len(index) < count:
         samples = taken_rows(samples, engine.constant(index.astype(np.int32), samples.ids))

@@ -84,12 +84,12 @@ def _put(index, z, t, y, x, k, row, depth, triangle):
     return k
 
 
-def reached_by_light(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which samples (K, H, W) light reaches, and which rows (N,) these are.
+def seen_along_rays(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which samples (K, H, W) rays meet before they end, and which rows (N,) these are.
 
     Args:
         row: (K, H, W), front to back, or −1.
-        blocks: (N,) bool, whether light ends at a sample.
+        blocks: (N,) bool, whether rays end at a sample.
     """
     reached, used = np.empty(row.shape, np.bool_), np.zeros(len(blocks), np.bool_)
     parallel(_reach, row.shape[1], read_only(row, np.int32), read_only(blocks), reached, used, work=3 * row.size)
@@ -112,14 +112,14 @@ def _reach(start, stop, row, blocks, reached, used):
 def kept(
     reached: np.ndarray, place: np.ndarray, row: np.ndarray, depth: np.ndarray, triangle: np.ndarray | None
 ) -> tuple[np.ndarray, ...]:
-    """Row, depth and triangle, if there is one, (K, H, W) of samples that are `reached`, −1 and 0 elsewhere.
+    """New rows, depths and, if there are any, triangles of the samples in cells: −1, 0 and −1 in those to be emptied.
 
     Args:
-        reached: (K, H, W) bool.
-        place: (N,) int32, the new row of each.
-        row: (K, H, W), likewise.
-        depth: (K, H, W), likewise.
-        triangle: (K, H, W), likewise, or None.
+        reached: (K, H, W) bool, the cells that keep their sample.
+        place: (N,) int32, the new index of each row.
+        row: (K, H, W), the old rows.
+        depth: (K, H, W), their depths.
+        triangle: (K, H, W), their triangles; or None.
     """
     triangles = np.empty((0, *row.shape[1:]), np.int32) if triangle is None else triangle
     known = read_only(row, np.int32), read_only(depth), read_only(triangles, np.int32)

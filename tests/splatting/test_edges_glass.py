@@ -278,6 +278,17 @@ def test_what_lies_behind_opaque_parts_is_left_out(sampler):
     np.testing.assert_allclose(image, drawn([*parts[:2], *parts[3:]], layers="auto", sampler=sampler), atol=1e-6)
 
 
+def test_layers_are_found_that_are_seen_between_centres_alone():
+    """Panes stick out from behind a wall by less than a pixel, between two columns of centres."""
+    wall, glass = HALF.copy(), HALF.copy()
+    wall[wall[:, 0] > 0, 0], glass[glass[:, 0] > 0, 0] = 12.55, 13.35
+    panes = [(RED, 0.3), (GREEN, 0.3), (BLUE, 0.3), (RED + GREEN, 0.9)]
+    parts = [pane(wall, 3, (1, 1, 1), 1), *(pane(glass, 4 + i, *layer) for i, layer in enumerate(panes))]
+    image = drawn(parts, layers="auto")
+    np.testing.assert_allclose(image[12, 12], 0.55 * np.ones(4) + 0.45 * over(*panes), atol=1e-3)
+    np.testing.assert_allclose(image[12, 13], 0.35 * over(*panes), atol=1e-3)
+
+
 def test_layers_that_are_found_are_as_many_as_light_goes():
     """With layers="auto" all panes are composited; with too few of them a warning says so."""
     parts = [pane(EVERYWHERE, 3 + i, np.eye(3)[i % 3], 0.3) for i in range(5)]
