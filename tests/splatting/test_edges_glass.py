@@ -259,8 +259,8 @@ def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
 @pytest.mark.parametrize("sampler", ["raster", "reference"])
 def test_what_lies_behind_opaque_parts_is_left_out(sampler):
     """A wall between panes covers the left half of the image; the reference samples part by part."""
-    parts = [pane(EVERYWHERE, 2, RED, 0.3), pane(HALF, 3, GREEN, 1)]
-    parts += [pane(EVERYWHERE if i else HALF, 4 + i, BLUE, 0.5) for i in range(3)]
+    parts = [pane(EVERYWHERE, 2, RED, 0.3), pane(HALF, 3, GREEN, 1), pane(HALF - [4, 0], 4, BLUE, 0.5)]
+    parts += [pane(EVERYWHERE, 5 + i, BLUE, 0.5) for i in range(2)]
     sampled = rts.sample(parts, in_pixels(), SIZE, splatter="edges", sampler=sampler)
     kept = rts.sample(parts, in_pixels(), SIZE, splatter=None, sampler=sampler)
     assert (sampled.row.shape[0], kept.row.shape[0]) == (4, 6)
