@@ -82,7 +82,7 @@ _shared_of = attrgetter(*_SHARED)
 
 
 class Told(NamedTuple):
-    """What samples beside a break have to tell. Of one layer two samples tell either, four tell both.
+    """The tasks of samples beside a break. Of one layer two samples tell colours or motions, and four tell both.
 
     Attributes:
         colors: False if each part has one colour, which any of its samples tells.
@@ -94,7 +94,8 @@ class Told(NamedTuple):
 
     @classmethod
     def of(cls, *scenes: Scene) -> Told:
-        """What shaders of scenes, and derivatives in their values, have to be told; of one colour always motions."""
+        """The tasks that the shaders of scenes, and derivatives in their values, set."""
+        # Of one colour any two samples tell all, those of motions too.
         uniform = all(part.uniform for scene in scenes for part in scene.parts)
         return cls(not uniform, uniform or not all(map(is_still, scenes)))
 

@@ -99,7 +99,7 @@ def sampled_scene(
         return replace(sampled, supersample=factor, apron=settings.apron)
 
     def taken(count: int) -> Sampled:
-        if not outlines:
+        if not outlines or capacity is not None:  # A capacity promises so many rows.
             return sampled_parts(scene, grid, request, count)
         # Samples do not spread, so that what lies behind an opaque one has no effect.
         return without_hidden(sampled_parts(scene, grid, request, count, of_opaque=1), scene.opaque)

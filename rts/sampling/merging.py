@@ -1,4 +1,4 @@
-"""The samples of all parts of a scene, merged by depth."""
+"""The samples of all parts of a scene, merged by depth; without those behind opaque ones."""
 
 from __future__ import annotations
 
@@ -56,31 +56,31 @@ def without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
     """
     from rts.sampling import merging_loops
 
-    if not any(opaque) or len(sampled.row) == 1:
+    if not any(opaque) or sampled.row.shape[-3] == 1:
         return sampled
     engine, row = engine_of(sampled.row), sampled.row
     known = value_of(row) if engine.on_host(row) else None
     if known is None or known.ndim != row.ndim:
         return sampled
     counts = [one.ids.shape[0] for one in sampled.samples]
-    reached, used = merging_loops.seen_along_rays(known, np.repeat(opaque, counts))
-    if np.array_equal(reached, known >= 0):
+    seen, used = merging_loops.seen_along_rays(known, np.repeat(opaque, counts))
+    if np.array_equal(seen, known >= 0):
         return sampled
     samples, place, first, start = [], np.full(len(used), -1, np.int32), 0, 0
     for one, count in zip(sampled.samples, counts, strict=True):
-        seen = used[first : first + count]
-        # A part that nobody sees has one unused row.
-        index = np.arange(count) if engine.padded(row) else np.flatnonzero(seen if seen.any() else np.arange(count) < 1)
+        in_use = used[first : first + count]
+        index = np.arange(count) if engine.padded(row) else np.flatnonzero(in_use)
+        index = index if len(index) else np.zeros(1, int)  # A part that nobody sees has one unused row.
         own = np.full(count + 1, -1, np.int32)
-        own[index] = np.where(seen[index], np.arange(len(index)), -1)
+        own[index] = np.where(in_use[index], np.arange(len(index)), -1)
         place[first : first + count] = own[:-1] + start
         samples.append(_with_rows(one, index, own))
         first, start = first + count, start + len(index)
-    depth, triangle = (None if x is None else value_of(x) for x in (sampled.depth, sampled.triangle))
-    assert depth is not None
-    found = merging_loops.kept(reached, place, known, depth, triangle)
-    of = row, sampled.depth, sampled.triangle
-    cells = Cells(*(engine.constant(x, like) for x, like in zip(found, of, strict=False)))
+    of_cells = [row, sampled.depth, sampled.cells.first(0).row if sampled.triangle is None else sampled.triangle]
+    known = [np.array(value_of(x)) for x in of_cells]
+    merging_loops.keep(seen, place, *known)
+    cells = [engine.constant(x, like) for x, like in zip(known, of_cells, strict=True)]
+    cells = Cells(*(cells[:2] if sampled.triangle is None else cells))
     return replace(sampled, samples=tuple(samples), cells=cells)
 
 

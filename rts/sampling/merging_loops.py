@@ -1,4 +1,4 @@
-"""Layers of several parts interleaved by depth, compiled."""
+"""Layers of several parts interleaved by depth, and emptied behind opaque ones, compiled."""
 
 from __future__ import annotations
 
@@ -85,57 +85,51 @@ def _put(index, z, t, y, x, k, row, depth, triangle):
 
 
 def seen_along_rays(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which samples (K, H, W) rays meet before they end, and which rows (N,) these are.
+    """The samples (K, H, W) that rays meet before they end, and the rows (N,) that these have; both bool.
 
     Args:
         row: (K, H, W), front to back, or −1.
         blocks: (N,) bool, whether rays end at a sample.
     """
-    reached, used = np.empty(row.shape, np.bool_), np.zeros(len(blocks), np.bool_)
-    parallel(_reach, row.shape[1], read_only(row, np.int32), read_only(blocks), reached, used, work=3 * row.size)
-    return reached, used
+    seen, used = np.empty(row.shape, np.bool_), np.zeros(len(blocks), np.bool_)
+    parallel(_look, row.shape[1], read_only(row, np.int32), read_only(blocks), seen, used, work=3 * row.size)
+    return seen, used
 
 
 @loop
-def _reach(start, stop, row, blocks, reached, used):
-    """Fill lines of `reached`, and mark rows as `used`."""
+def _look(start, stop, row, blocks, seen, used):
+    """Fill lines of `seen`, and mark rows as `used`."""
     for y in range(start, stop):
         for x in range(row.shape[2]):
-            lit = True
+            goes_on = True
             for k in range(len(row)):
                 n = row[k, y, x]
-                reached[k, y, x] = lit and n >= 0
-                if reached[k, y, x]:
-                    used[n], lit = True, not blocks[n]
+                seen[k, y, x] = goes_on and n >= 0
+                if seen[k, y, x]:
+                    used[n], goes_on = True, not blocks[n]
 
 
-def kept(
-    reached: np.ndarray, place: np.ndarray, row: np.ndarray, depth: np.ndarray, triangle: np.ndarray | None
-) -> tuple[np.ndarray, ...]:
-    """New rows, depths and, if there are any, triangles of the samples in cells: −1, 0 and −1 in those to be emptied.
+def keep(seen: np.ndarray, place: np.ndarray, row: np.ndarray, depth: np.ndarray, triangle: np.ndarray) -> None:
+    """Empty the cells whose sample is not seen, and renumber the other rows; all but `seen` and `place` are changed.
 
     Args:
-        reached: (K, H, W) bool, the cells that keep their sample.
+        seen: (K, H, W) bool.
         place: (N,) int32, the new index of each row.
-        row: (K, H, W), the old rows.
-        depth: (K, H, W), their depths.
-        triangle: (K, H, W), their triangles; or None.
+        row: (K, H, W) int32, or −1.
+        depth: (K, H, W) of the samples; 0 where there is none.
+        triangle: (K, H, W) int32, likewise, −1 where there is none; or (0, H, W).
     """
-    triangles = np.empty((0, *row.shape[1:]), np.int32) if triangle is None else triangle
-    known = read_only(row, np.int32), read_only(depth), read_only(triangles, np.int32)
-    results = np.empty(row.shape, np.int32), np.empty(row.shape, depth.dtype), np.empty(triangles.shape, np.int32)
-    parallel(_keep, row.shape[1], reached, read_only(place), *known, *results, work=4 * row.size)
-    return results if triangle is not None else results[:2]
+    parallel(_keep, row.shape[1], seen, read_only(place), row, depth, triangle, work=4 * row.size)
 
 
 @loop
-def _keep(start, stop, reached, place, row, depth, triangle, to_row, to_depth, to_triangle):
-    """Fill lines of the results of `kept`."""
+def _keep(start, stop, seen, place, row, depth, triangle):
+    """`keep`, of some lines."""
     for k in range(len(row)):
         for y in range(start, stop):
             for x in range(row.shape[2]):
-                there = reached[k, y, x]
-                to_row[k, y, x] = place[row[k, y, x]] if there else -1
-                to_depth[k, y, x] = depth[k, y, x] if there else 0
+                there = seen[k, y, x]
+                row[k, y, x] = place[row[k, y, x]] if there else -1
+                depth[k, y, x] = depth[k, y, x] if there else 0
             for x in range(row.shape[2] if len(triangle) else 0):
-                to_triangle[k, y, x] = triangle[k, y, x] if reached[k, y, x] else -1
+                triangle[k, y, x] = triangle[k, y, x] if seen[k, y, x] else -1
