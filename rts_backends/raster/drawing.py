@@ -27,6 +27,9 @@ AT_ONCE = 8
 LISTED = 8
 """Numbers listed for a triangle: its index, its three vertices, first and last column, first and last row of pixels."""
 
+TILE = 16
+"""Columns of a band whose farthest depth is kept, so that triangles behind are left out at once."""
+
 NUMBERS = 18
 """Numbers computed for a triangle: coefficients (x, y, 1) of its three edge functions, positive inside; depths of its
 corners; the corners' w + z of clip space; and their w − z."""
@@ -40,15 +43,21 @@ def draw(first, last, triangles, vertices, matrix, view_depth, size, fragments):
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width) = len(triangle_ids), size
-    nearest = np.empty((layers, BAND_ROWS * width))
+    nearest, farthest = np.empty((layers, BAND_ROWS * width)), np.empty(-(-width // TILE))
     keep, turns, offsets, items, rows = triangles
     geometry = rows, vertices, matrix, view_depth, keep
     for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         start, stop = top * width, end * width
         nearest[:], triangle_ids[:, start:stop], barycentrics[:, start:stop] = np.inf, -1, 0
-        here, layered = items[offsets[band] : offsets[band + 1]], (start, nearest, triangle_ids, barycentrics)
-        _draw(here, geometry, top, end, width, layered)
+        layered = start, nearest, triangle_ids, barycentrics
+        begin, middle, last_item = offsets[2 * band], offsets[2 * band + 1], offsets[2 * band + 2]
+        farthest[:] = np.inf
+        _draw(items[begin:middle], geometry, top, end, width, farthest, layered)
+        # Of closed surfaces nothing more is seen.
+        if middle < last_item:
+            _farthest(nearest[-1, : (end - top) * width], width, farthest)
+            _draw(items[middle:last_item], geometry, top, end, width, farthest, layered)
         for k in range(layers):
             _depths(depths[k, start:stop], nearest[k])
 
@@ -61,7 +70,16 @@ def _depths(depths, nearest):
 
 
 @compiled
-def _draw(items, geometry, top, end, width, layered):
+def _farthest(last, width, farthest):
+    """Fill `farthest` with the largest depth of the last layer, `last` (rows · width,), in each `TILE` columns."""
+    farthest[:] = 0.0
+    for start in range(0, len(last), width):
+        for i in range(width):
+            farthest[i // TILE] = max(farthest[i // TILE], last[start + i])
+
+
+@compiled
+def _draw(items, geometry, top, end, width, farthest, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
     Args:
@@ -71,6 +89,7 @@ def _draw(items, geometry, top, end, width, layered):
         top: first row.
         end: end of the rows.
         width: columns of the image.
+        farthest: (ceil(width / TILE),), depths in these columns behind which the layers have no room; else infinite.
         layered: the index of the band's first cell among M; `nearest`, depths (K, ·); ids (K, M); and barycentrics (K,
             M, 2). They hold the layers found so far, or empty ones.
     """
@@ -89,6 +108,7 @@ def _draw(items, geometry, top, end, width, layered):
         block = items[start : start + BLOCK]
         _gather(block, rows, vertices, entries, points)
         _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
+        _leave_out(len(block), farthest, numbers, entries)
         _cover(len(block), entries, numbers, covers)
         count = 0
         for b in range(len(block)):
@@ -217,6 +237,19 @@ def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, c
             numbers[3 * c, b] = signs[b] * (ay * bw - aw * by)
             numbers[3 * c + 1, b] = signs[b] * (aw * bx - ax * bw)
             numbers[3 * c + 2, b] = signs[b] * (ax * by - ay * bx)
+
+
+@compiled
+def _leave_out(count, farthest, numbers, entries):
+    """Leave triangles of a block without rows that lie behind the depths `farthest` of all their columns."""
+    for b in range(count):
+        z = min(numbers[9, b], numbers[10, b], numbers[11, b])
+        z -= 1e-12 * abs(z)  # Depths between corners are rounded.
+        seen = False
+        for n in range(entries[4, b] // TILE, entries[5, b] // TILE + 1):
+            seen |= z <= farthest[n]
+        if not seen:
+            entries[7, b] = -1
 
 
 @compiled(inline="always")

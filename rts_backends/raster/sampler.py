@@ -6,8 +6,9 @@ stays (`rts.prepare`) this pass skips whole clusters of triangles (`rts_backends
 
 A second pass draws the image in bands of rows, each by one thread. For blocks of listed triangles it computes, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that these triangles
-cover, and inserts the triangles into the pixels' layers. The result depends neither on the number of threads nor on the
-order of the list.
+cover, and inserts the triangles into the pixels' layers. Those seen from behind come last: most lie behind full layers,
+where they are left out before their pixels are looked at. The result depends neither on the number of threads nor on
+the order of the list.
 """
 
 from __future__ import annotations
@@ -112,8 +113,8 @@ def _drawn(
 
     chunks, bands = -(-len(blocks) // PER_CHUNK), -(-height // BAND_ROWS)
     # Threads should not write to neighbouring memory.
-    spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
-    geometry = blocks, faces, vertices, screen, matrix, height, width, step, keep
+    spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, 2 * bands), np.int64)
+    geometry = blocks, faces, vertices, screen, matrix, height, width, step, keep, camera.kept_sign("back")
     parallel(select, chunks, *geometry, (rows, spans, counts), work=10 * SIZE * len(blocks))
     triangles = sorted_list(keep, order, rows, spans, counts)
 

@@ -42,7 +42,7 @@ class TriangleList(NamedTuple):
     Attributes:
         keep: sign of the determinants of triangles to draw; 0 for both signs.
         turns: (bands,), indices of bands of rows, those with most items first, so that threads end together.
-        offsets: (bands + 1,), where the items of each band begin.
+        offsets: (2 · bands + 1,), where the items of each band begin: those seen from the front, those from behind.
         items: uint32, for each band the triangles whose boxes touch it, as indices of `rows`.
         rows: (T, LISTED) int32, the numbers listed for each triangle.
     """
@@ -62,11 +62,12 @@ def sorted_list(
     In `rows`, indices of triangles are replaced by those in the proxy, in place.
     """
     sums = counts.sum(axis=0)
+    of_bands = sums[::2] + sums[1::2]
     offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
         parallel(_sort, len(spans), order, rows, spans, places, items, work=5 * len(items))
-    return TriangleList(keep, np.argsort(-sums), offsets, items, rows)
+    return TriangleList(keep, np.argsort(-of_bands), offsets, items, rows)
 
 
 @loop
@@ -98,19 +99,21 @@ def project(first, last, used, vertices, m, screen):
 
 
 @loop
-def select(first, last, blocks, faces, vertices, screen, matrix, height, width, step, keep, made):
+def select(first, last, blocks, faces, vertices, screen, matrix, height, width, step, keep, front, made):
     """List and count the triangles that may cover the centre of a pixel, and whose determinants may have a sign.
 
     The search goes through chunks [first, last) of `blocks`, the indices of blocks of triangles. `keep` is the sign, 0
-    for both.
+    for both; `front` is that of triangles seen from the front.
 
     `made` is the list, to be filled: a row for each triangle (T, LISTED), where the rows of each chunk begin and end
-    (chunks, 2), and the number of a chunk's triangles that touch each band (chunks, bands). One call writes its chunks
-    one after another.
+    (chunks, 2), and the numbers of a chunk's triangles that touch each band, seen from the front and from behind
+    (chunks, 2 · bands). A row begins with the triangle's index t, or −1 − t if it is seen from behind. One call writes
+    its chunks one after another.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
-    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
+    clips, near, behind = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     near_ones, step = np.empty(LONG_BLOCK, np.uint32), np.float32(step)
+    signs = np.float32(keep), np.float32(front)
     geometry, place = (vertices, matrix, height, width, step), first * CHUNK
     for chunk in range(first, last):
         made[1][chunk, 0] = place
@@ -119,18 +122,20 @@ def select(first, last, blocks, faces, vertices, screen, matrix, height, width, 
             block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            _look(len(block), xy, height, width, step, np.float32(keep), box, clips, near)
-            place = _append(chunk, start, block, near, box, clips, near_ones, geometry, place, made)
+            _look(len(block), xy, height, width, step, signs, box, clips, near, behind)
+            place = _append(chunk, start, block, near, box, clips, behind, near_ones, geometry, place, made)
         made[1][chunk, 1] = place
 
 
 @compiled(inline="always")
-def _look(count, xy, height, width, step, sign, box, clips, near):
+def _look(count, xy, height, width, step, signs, box, clips, near, behind):
     """Fill in each triangle's box of pixels, and marks: `clips`, it may need clipping; `near`, it is to be listed.
 
     `xy` (3, ·) are the corners' positions of `project`. `box` (4, ·) gets first and last column, first and last row. A
-    triangle is `near` if it may cover a pixel's centre and may face as `sign` says, or if it `clips`.
+    triangle is `near` if it may cover a pixel's centre and may face as `keep`, the first of the `signs`, says, or if it
+    `clips`. It is `behind` if it is likely to be seen from there, by the second.
     """
+    keep, front = signs
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -149,7 +154,8 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
         # Rounding changes coordinates by at most half a step. Then edge functions change by at most the sum of the
         # box's sides and 2.5, and their sum by twice that. The rest is for the centre, rounded to a hundredth.
         bound = more * (x1 - x0 + y1 - y0 + four)
-        away = (ea + eb + ec) * sign < -(bound + bound)
+        away = (ea + eb + ec) * keep < -(bound + bound)
+        behind[b] = (ea + eb + ec) * front < 0
         placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
         clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
         missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
@@ -157,7 +163,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 
 @compiled(inline="always")
-def _append(chunk, start, block, near, box, clips, near_ones, geometry, place, made):
+def _append(chunk, start, block, near, box, clips, behind, near_ones, geometry, place, made):
     """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
 
     Left out are clipped ones that cover no centre. Returns the next free row.
@@ -178,12 +184,12 @@ def _append(chunk, start, block, near, box, clips, near_ones, geometry, place, m
             i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
             if i0 > i1 or j0 > j1:
                 continue
-        rows[place, 0] = start + b
+        rows[place, 0] = -1 - (start + b) if behind[b] else start + b
         rows[place, 1], rows[place, 2], rows[place, 3] = block[b, 0], block[b, 1], block[b, 2]
         rows[place, 4], rows[place, 5], rows[place, 6], rows[place, 7] = i0, i1, j0, j1
         place += 1
         for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
-            counts[chunk, band] += 1
+            counts[chunk, 2 * band + behind[b]] += 1
     return place
 
 
@@ -225,16 +231,17 @@ def _clipped_box(corners, width, height):
 
 @loop
 def _sort(first, last, order, rows, spans, places, items):
-    """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, bands) on.
+    """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, 2 · bands) on.
 
     Only chunks [first, last) are sorted; `places` move on. In the list, `order` replaces triangles' indices by those of
     the proxy; if `order` is empty, they are the same.
     """
     for chunk in range(first, last):
-        if len(order) > 0:
-            for n in range(spans[chunk, 0], spans[chunk, 1]):
-                rows[n, 0] = order[rows[n, 0]]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
+            t = rows[n, 0]
+            behind = t < 0
+            t = -1 - t if behind else t
+            rows[n, 0] = order[t] if len(order) > 0 else t
             for band in range(rows[n, 6] // BAND_ROWS, rows[n, 7] // BAND_ROWS + 1):
-                items[places[chunk, band]] = n
-                places[chunk, band] += 1
+                items[places[chunk, 2 * band + behind]] = n
+                places[chunk, 2 * band + behind] += 1

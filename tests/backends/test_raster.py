@@ -293,6 +293,28 @@ def test_large_triangles_and_many_small_ones_in_one_band_lose_nothing():
     assert len(np.unique(found.triangle_ids)) == count + 2
 
 
+@pytest.mark.parametrize("layers", [1, 2])
+def test_triangles_seen_from_behind_around_a_full_image_are_found(layers):
+    # Where the layers are full of triangles seen from the front, only those behind all of these may be left out.
+    size, rng = (48, 48), np.random.default_rng(1)
+    wall, faces = grid(-1.3, 10.1, 5)
+    wall[:, 2] = 1 / 8
+    centres, offsets = rng.uniform(0, 48, (120, 1, 2)), rng.uniform(-6, 6, (120, 3, 2))
+    x, y = np.moveaxis(centres + offsets, -1, 0)
+    # Some lie a hair before or behind the wall, others far.
+    away = 1 / 8 + rng.choice([1e-4, -1e-4, 1.0, -1.0], (120, 1)) * rng.uniform(0.5, 1, (120, 1))
+    corners = np.stack([x, -y, np.broadcast_to(away, x.shape)], -1).reshape(-1, 3)
+    (ax, ay), (bx, by) = (offsets[:, 1] - offsets[:, 0]).T, (offsets[:, 2] - offsets[:, 0]).T
+    own = np.arange(360).reshape(-1, 3)
+    own = np.where((ax * by > ay * bx)[:, None], own, own[:, ::-1])
+    vertices = np.concatenate([corners, wall, wall - (0, 0, 0.5)]).astype(np.float32)
+    faces = np.concatenate([own, faces + 360, faces + 360 + len(wall)]).astype(np.int32)
+    found, expected = (rasterize(name, vertices, faces, pixels(size), size, layers) for name in ("raster", "reference"))
+    np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+    np.testing.assert_allclose(found.depth, expected.depth, rtol=1e-6)
+    assert len(np.unique(found.triangle_ids[found.triangle_ids < 120])) > 40
+
+
 @pytest.mark.parametrize("x", [-1000.0, -9.0, 1000.0])
 def test_a_corner_far_outside_does_not_bend_a_thin_triangle(x):
     # At the pixel on the border its edges are 0.04 apart around the centre; its third corner is one row lower.
