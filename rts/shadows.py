@@ -28,7 +28,7 @@ from rts.scene.camera import Camera
 from rts.scene.default_camera import MARGIN, Bounds, bounds_of
 from rts.scene.parts import Part
 from rts.shading.light import check_light
-from rts.shading.visibility import Picture, Seen, picture_of, visibility
+from rts.shading.visibility import DepthPicture, Seen, picture_of, visibility
 
 __all__ = ["Seen", "seen_from", "visibility", "with_shadows"]
 
@@ -82,7 +82,7 @@ def seen_from(
 
 def _picture(
     parts: Sequence[Part], camera: Camera, size: tuple[int, int], sampler: Any, layers: Any, capacity: Any, engine: Any
-) -> Picture:
+) -> DepthPicture:
     """The picture of parts that have one number of layers."""
     scene = Scene.of(parts, camera, sampler, engine).at(size)
     sampled = sampled_scene(scene, scene.camera, size, RenderSettings(None, layers, 1, capacity), one_shader=False)

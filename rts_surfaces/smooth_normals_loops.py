@@ -16,7 +16,7 @@ from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 
 
-class Normals(NamedTuple):
+class VertexNormals(NamedTuple):
     """Normals of the vertices that samples name.
 
     Attributes:
@@ -30,7 +30,9 @@ class Normals(NamedTuple):
     length: np.ndarray
 
 
-def forward(vertices: np.ndarray, params: np.ndarray, ids: np.ndarray, faces: np.ndarray, out: np.ndarray) -> Normals:
+def forward(
+    vertices: np.ndarray, params: np.ndarray, ids: np.ndarray, faces: np.ndarray, out: np.ndarray
+) -> VertexNormals:
     """Fill `out` (N, 3) with interpolated normals. An InputError if an id names no vertex."""
     normals = _normals(vertices, ids, faces)
     _interpolate_all(normals, normals.unit, params, ids, out, False)
@@ -45,7 +47,7 @@ def push(
     t_vertices: np.ndarray | None,
     t_params: np.ndarray | None,
     out: np.ndarray,
-    kept: Normals | None,
+    kept: VertexNormals | None,
 ) -> None:
     """Fill `out` (N, 3) with the derivative along `t_vertices` (V, 3) and `t_params` (N, 2), each None if zero."""
     normals = kept or _normals(vertices, ids, faces)
@@ -67,7 +69,7 @@ def pull(
     g: np.ndarray,
     g_vertices: np.ndarray | None,
     g_params: np.ndarray | None,
-    kept: Normals | None,
+    kept: VertexNormals | None,
 ) -> None:
     """Pull back the gradient `g` (N, 3): add to `g_vertices` (V, 3), fill `g_params` (N, 2), unless None."""
     normals = kept or _normals(vertices, ids, faces)
@@ -80,7 +82,7 @@ def pull(
         parallel(_weigh, len(ids), normals.row_of, normals.unit, ids, g, g_params, work=10 * len(ids))
 
 
-def _normals(vertices: np.ndarray, ids: np.ndarray, faces: np.ndarray) -> Normals:
+def _normals(vertices: np.ndarray, ids: np.ndarray, faces: np.ndarray) -> VertexNormals:
     """The normals of the vertices that `ids` name. An InputError if an id, or a face, names no vertex."""
     row_of = np.zeros(len(vertices), np.int32)
     count = _number(ids, row_of)
@@ -88,11 +90,11 @@ def _normals(vertices: np.ndarray, ids: np.ndarray, faces: np.ndarray) -> Normal
     if count < 0 or not _add_faces(vertices, faces, row_of, unit):
         raise InputError(f"samples or faces refer to vertices that are not among {len(vertices)}; sample the mesh anew")
     _normalize(unit, length)
-    return Normals(row_of, unit, length)
+    return VertexNormals(row_of, unit, length)
 
 
 def _interpolate_all(
-    normals: Normals, rows: np.ndarray, params: np.ndarray, ids: np.ndarray, out: np.ndarray, moved: bool
+    normals: VertexNormals, rows: np.ndarray, params: np.ndarray, ids: np.ndarray, out: np.ndarray, moved: bool
 ) -> None:
     """Fill `out` (N, 3) by interpolation of `rows` (U, 3); if weights are `moved`, add what `params` (N, 2) add."""
     parallel(_interpolate, len(ids), normals.row_of, rows, params, ids, moved, out, work=12 * len(ids))

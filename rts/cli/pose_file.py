@@ -18,7 +18,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 
-class Pose(NamedTuple):
+class ModelPose(NamedTuple):
     """The pose of a model, and the camera that sees it.
 
     Attributes:
@@ -47,7 +47,7 @@ class Pose(NamedTuple):
         }
 
 
-def read_pose(path: Any) -> Pose:
+def read_pose(path: Any) -> ModelPose:
     """The pose in a file of JSON with a `matrix`, a `size`, and a `camera` of `view` and `projection`.
 
     Raises:
@@ -66,7 +66,7 @@ def read_pose(path: Any) -> Pose:
         raise InputError(f"{path}: {error}") from error
 
 
-def _pose(entries: Any) -> Pose:
+def _pose(entries: Any) -> ModelPose:
     camera = _entry(entries, "camera")
     matrices = {"matrix": _entry(entries, "matrix")}
     matrices |= {name: _entry(camera, name) for name in ("view", "projection")}
@@ -79,7 +79,7 @@ def _pose(entries: Any) -> Pose:
     aspect = camera.get("aspect")
     if aspect is not None:
         check_numbers("aspect", aspect, ())
-    return Pose(matrices["matrix"], Camera(matrices["view"], matrices["projection"], aspect), size)
+    return ModelPose(matrices["matrix"], Camera(matrices["view"], matrices["projection"], aspect), size)
 
 
 def _entry(entries: Any, name: str) -> Any:

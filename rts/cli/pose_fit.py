@@ -12,7 +12,7 @@ from rts import registry
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_named, engine_of, namespace
 from rts.arrays.trees import Array
-from rts.cli.pose_file import Pose, posed
+from rts.cli.pose_file import ModelPose, posed
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
@@ -47,17 +47,17 @@ class PoseFit(NamedTuple):
     rotation: np.ndarray
     translation: np.ndarray
     center: np.ndarray
-    trail: list[Pose]
+    trail: list[ModelPose]
     history: list[float]
     levels: list[int]
-    start: Pose
+    start: ModelPose
     first_loss: float
     loss: float
     reason: str
     seconds: float
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> ModelPose:
         """The recovered pose, and its camera."""
         return self.trail[-1]
 
@@ -153,7 +153,7 @@ def fit_pose(
         trail,
         result.history,
         list(result.stages),
-        Pose(np.eye(4), camera, target.shape),
+        ModelPose(np.eye(4), camera, target.shape),
         float(residuals.loss(residuals.at_stage(schedule[-1])(start))),
         result.loss,
         result.reason,
@@ -197,8 +197,8 @@ def _residuals(
     return ImageResiduals(silhouettes, None, target.shape, target, layers=1, splatter="single", **options)
 
 
-def _pose(unknowns: np.ndarray, bounds: Bounds, camera: Camera, size: tuple[int, int]) -> Pose:
-    return Pose(np.asarray(rigid(unknowns[:6], bounds.center)), _zoomed(camera, unknowns[6:]), size)
+def _pose(unknowns: np.ndarray, bounds: Bounds, camera: Camera, size: tuple[int, int]) -> ModelPose:
+    return ModelPose(np.asarray(rigid(unknowns[:6], bounds.center)), _zoomed(camera, unknowns[6:]), size)
 
 
 def _zoomed(camera: Camera, focal: Array) -> Camera:

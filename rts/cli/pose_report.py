@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.cli.pose_file import Pose, posed
+from rts.cli.pose_file import ModelPose, posed
 from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
 from rts.cli.pose_verdict import Verdict
 from rts.diagnostics.notebooks import losses_png
@@ -56,7 +56,7 @@ def write_report(
         (folder / "pose.json").write_text(text, encoding="utf-8")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
-    def picture(pose: Pose, mask: np.ndarray) -> np.ndarray:
+    def picture(pose: ModelPose, mask: np.ndarray) -> np.ndarray:
         return _outlined([*posed(parts, pose.matrix), *scenery], pose.camera, mask)
 
     save_image(folder / "before.png", picture(result.start, large))
@@ -83,7 +83,7 @@ def _numbers(result: PoseFit) -> dict[str, Any]:
     }
 
 
-def _moved(before: Pose, after: Pose) -> bool:
+def _moved(before: ModelPose, after: ModelPose) -> bool:
     """True if a step changes an entry of the pose or of the projection by enough to be seen, 1e-4."""
     changes = after.matrix - before.matrix, after.camera.projection - before.camera.projection
     return max(float(np.abs(c).max()) for c in changes) > 1e-4

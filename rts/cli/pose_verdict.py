@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.cli.pose_file import Pose, posed
+from rts.cli.pose_file import ModelPose, posed
 from rts.rendering.image import render
 from rts.scene.parts import Part
 
@@ -48,7 +48,7 @@ class Verdict(NamedTuple):
 
 
 def judged(
-    pose: Pose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndarray | None = None, robust: bool = False
+    pose: ModelPose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndarray | None = None, robust: bool = False
 ) -> Verdict:
     """The verdict on a pose: how well its silhouette fits the mask, and doubts about the mask.
 

@@ -47,7 +47,7 @@ SPINNING = (
 )
 
 
-class Stage(NamedTuple):
+class StageTime(NamedTuple):
     """One stage of a render.
 
     Attributes:
@@ -74,7 +74,7 @@ class Profile(NamedTuple):
         hint: what would help most.
     """
 
-    stages: tuple[Stage, ...]
+    stages: tuple[StageTime, ...]
     parts: int
     hint: str
 
@@ -151,24 +151,24 @@ def profile(
     if settings.finds_outlines:
         plain = replace(settings, splatter=check_splatter("none"))
         bare, first, later = timed(lambda: sampled_with(plain))
-        stages.append(Stage(SAMPLING, first, later, _rows(bare), _megabytes(bare)))
+        stages.append(StageTime(SAMPLING, first, later, _rows(bare), _megabytes(bare)))
     sampled, whole_first, whole_later = timed(lambda: sampled_with(settings))
     if stages:
         found, before = sampled.outlines, stages[0]
         count = 0 if found is None else found.place.shape[0]
         spent = max(whole_first - before.first, 0.0), max(whole_later - before.later, 0.0)
-        stages.append(Stage(OUTLINES, *spent, count, _megabytes(found)))
+        stages.append(StageTime(OUTLINES, *spent, count, _megabytes(found)))
     else:
-        stages.append(Stage(SAMPLING, whole_first, whole_later, _rows(sampled), _megabytes(sampled)))
+        stages.append(StageTime(SAMPLING, whole_first, whole_later, _rows(sampled), _megabytes(sampled)))
     splats, first, later = timed(lambda: to_splats(sampled, scene.parts, scene.camera, scene.camera, context))
-    stages.append(Stage(SHADING, first, later, splats.rgba.shape[0], _megabytes((splats.positions, splats.rgba))))
+    stages.append(StageTime(SHADING, first, later, splats.rgba.shape[0], _megabytes((splats.positions, splats.rgba))))
     image, first, later = timed(lambda: image_of_splats(chosen, splats, settings.supersample))
-    stages.append(Stage(SPLATTING, first, later, size[0] * size[1], _megabytes(image)))
+    stages.append(StageTime(SPLATTING, first, later, size[0] * size[1], _megabytes(image)))
     if context.engine.differentiates:
         spent = sum(stage.later for stage in stages)
         first, later, count = _gradient(scene, size, settings, timed)
         if count:
-            stages.append(Stage(BACKWARD, max(first - spent, 0.0), max(later - spent, 0.0), count, 0.0))
+            stages.append(StageTime(BACKWARD, max(first - spent, 0.0), max(later - spent, 0.0), count, 0.0))
     longest = max(stages, key=lambda stage: stage.later)
     return Profile(tuple(stages), len(scene.parts), HINTS[longest.name])
 

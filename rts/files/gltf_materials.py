@@ -24,7 +24,7 @@ SPECULAR = "KHR_materials_specular"
 """The strength and the colour of what anything but metals reflects."""
 
 
-class Material(NamedTuple):
+class GltfMaterial(NamedTuple):
     """The part of a material that shaders use.
 
     Attributes:
@@ -74,7 +74,7 @@ class Material(NamedTuple):
         return plain[0], plain[1], plain[2]
 
 
-def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
+def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> GltfMaterial:
     """A material; refused if a colour or texture is invalid. Notes what is not followed."""
     name, maps = f"material {index}", Maps(gltf)
     look = dict(material.get("pbrMetallicRoughness", {}))
@@ -91,7 +91,7 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
         gltf.note(f"{OLDER}, of which the diffuse colour alone is read", name)
     unlit = UNLIT in material.get("extensions", {})
     entries = None if unlit or older else _entries(maps, material, look, name)
-    return Material(
+    return GltfMaterial(
         color,
         texture,
         alpha_mode=material.get("alphaMode", "OPAQUE"),
@@ -105,7 +105,7 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
 
 
 def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: str) -> dict[str, np.ndarray] | None:
-    """`Material.entries`; refused where a factor is no number, or out of its range."""
+    """`GltfMaterial.entries`; refused where a factor is no number, or out of its range."""
     gltf = maps.gltf
     keys = {*look} & set(STATED) | {*material} & {"normalTexture", "occlusionTexture", "emissiveTexture"}
     shine = material.get("extensions", {}).get(SPECULAR)

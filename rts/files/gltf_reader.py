@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.files.damaged_files import warn
 from rts.files.gltf_accessors import Accessor, read_accessor, read_attributes
-from rts.files.gltf_materials import Material, read_material, unit_colors
+from rts.files.gltf_materials import GltfMaterial, read_material, unit_colors
 from rts.files.gltf_scenes import motion_in, read_instances, surroundings_in, warn_of_left_out
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece
@@ -58,7 +58,7 @@ def read_scene(gltf: Gltf) -> tuple[list[tuple[Piece, dict[str, Any], int]], lis
 
 
 def _piece(
-    gltf: Gltf, name: str, primitive: dict[str, Any], accessors: list[Accessor], materials: list[Material]
+    gltf: Gltf, name: str, primitive: dict[str, Any], accessors: list[Accessor], materials: list[GltfMaterial]
 ) -> Piece:
     """A primitive, in local space; refused if of an unfit mode, material or attribute. `name` is for errors."""
     mode = count_of(primitive.get("mode", 4))
@@ -70,7 +70,7 @@ def _piece(
         warn(f"{gltf.path}: {name} is of {MODES[mode]}, which are left out")
     if "material" in primitive and count_of(primitive["material"]) >= len(materials):
         raise gltf.fail(f"{name} has material {primitive['material']}, which is not there")
-    material = materials[primitive["material"]] if "material" in primitive else Material()
+    material = materials[primitive["material"]] if "material" in primitive else GltfMaterial()
     read, corners = read_attributes(gltf, name, primitive, accessors)
     faces = corners[:0] if mode in MODES else corners
     if mode == 5:
@@ -118,7 +118,7 @@ def _piece(
     )
 
 
-def _placed(material: Material, entry: str, read: Mapping[str, Accessor]) -> bool:
+def _placed(material: GltfMaterial, entry: str, read: Mapping[str, Accessor]) -> bool:
     """True unless an entry of the material is a map whose coordinates are not `read`."""
     assert material.entries is not None
     way = material.lookups.get(entry, material.lookup)

@@ -45,7 +45,7 @@ STEEPEST = 1e6
 """The largest multiplier of heights."""
 
 
-class Material(NamedTuple):
+class MtlMaterial(NamedTuple):
     """The part of an MTL material that shaders use.
 
     Attributes:
@@ -99,7 +99,7 @@ class Material(NamedTuple):
         return entries or None, mistaken
 
 
-def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
+def read_mtl(library: Path, folder: Path) -> dict[str, MtlMaterial]:
     """The materials of a library by name. Textures are looked for in the folder.
 
     Raises:
@@ -186,7 +186,7 @@ def _numbers(library: Path, number: int, text: str) -> list[float]:
     return values
 
 
-def _material(values: dict[str, Any]) -> Material:
+def _material(values: dict[str, Any]) -> MtlMaterial:
     color, alpha = values.get("color"), values.get("alpha", 1.0)
     if "texture" in values:
         color = None if alpha >= 1 else np.ones(3)
@@ -206,4 +206,4 @@ def _material(values: dict[str, Any]) -> Material:
         del maps["specular"], options["map_ks"]
         unread.insert(0, "map_ks")
     unfollowed = [f"{name} of {key}" for key, names in options.items() for name in names]
-    return Material(color, texture, numbers, maps, values.get("multiplier", 1.0), tuple(unread), tuple(unfollowed))
+    return MtlMaterial(color, texture, numbers, maps, values.get("multiplier", 1.0), tuple(unread), tuple(unfollowed))

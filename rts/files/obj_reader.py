@@ -14,7 +14,7 @@ from rts.files import polygons
 from rts.files.damaged_files import contents, is_plain, lines_of, warn, without_comment
 from rts.files.images import read_texture
 from rts.files.model_pieces import Piece
-from rts.files.mtl_reader import Material, read_mtl
+from rts.files.mtl_reader import MtlMaterial, read_mtl
 from rts.files.paths import inside
 from rts.files.srgb import decode_srgb
 
@@ -212,7 +212,7 @@ def read_polygons(path: Path) -> Polygons:
     v, vt, _ = _rows(lines)
     used = {material for _, _, material in lines.faces}
     materials = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
-    material = materials[0] if len(used) == len(materials) == 1 else Material()
+    material = materials[0] if len(used) == len(materials) == 1 else MtlMaterial()
     corners, sizes, _ = lines.polygons()
     texture = None if material.texture is None else read_texture(material.texture, path)
     linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
@@ -247,7 +247,7 @@ def read_obj(path: Path) -> list[Piece]:
     lines = _Lines(path).read()
     materials = _materials(lines)
     used = {material for _, _, material in lines.faces}
-    looks = {name: materials.get(name, Material()) for name, index in lines.materials.items() if index in used}
+    looks = {name: materials.get(name, MtlMaterial()) for name, index in lines.materials.items() if index in used}
     textures = {name: read_texture(look.texture, path) for name, look in looks.items() if look.texture is not None}
     read = {name: look.entries(path) for name, look in looks.items()}
     unread = [f"{key} of {name!r}" for name, look in looks.items() for key in look.unread]
@@ -286,9 +286,9 @@ def read_obj(path: Path) -> list[Piece]:
     return pieces
 
 
-def _materials(lines: _Lines) -> dict[str | None, Material]:
+def _materials(lines: _Lines) -> dict[str | None, MtlMaterial]:
     """The materials of all libraries by name; a warning if a library, or a material that is used, is missing."""
-    materials: dict[str | None, Material] = {}
+    materials: dict[str | None, MtlMaterial] = {}
     complete = True
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)

@@ -25,7 +25,7 @@ from rts.sampling.joint import is_suited, with_joints
 from rts.sampling.merging import sampled_parts
 from rts.sampling.picture import Picture, at_once, renumbered
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.side_by_side import View, joined
+from rts.sampling.side_by_side import DrawnView, joined
 
 
 def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, told: Told) -> Sampled | None:
@@ -131,7 +131,7 @@ class _Call:
 
     def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         """The results of several items; None for those that cannot be drawn along with others, or lack room."""
-        views = [View.of(*self._entered(arrays)) for arrays in items]
+        views = [DrawnView.of(*self._entered(arrays)) for arrays in items]
         kinds: dict[tuple, list[int]] = {}
         for index, view in enumerate(views):
             if view is not None:
@@ -148,7 +148,7 @@ class _Call:
         results = dict(zip(found, self._results(list(found.values())), strict=True))
         return [results.get(index) for index in range(len(items))]
 
-    def _side_by_side(self, views: Sequence[View]) -> Iterator[Sampled]:
+    def _side_by_side(self, views: Sequence[DrawnView]) -> Iterator[Sampled]:
         """The samples of each of several views of one kind, drawn in one picture."""
         picture = Picture.of(len(views), self._grid.size)
         scene, grid = joined(views, picture)

@@ -26,7 +26,7 @@ MARGIN = 1
 """Cells along the border of a view in which there may be no vertex: what is seen there might join the next view."""
 
 
-class View(NamedTuple):
+class DrawnView(NamedTuple):
     """A view that can be drawn along with others: its scene, and where its triangles are seen. Host arrays.
 
     Attributes:
@@ -46,7 +46,7 @@ class View(NamedTuple):
     kind: tuple
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid) -> View | None:
+    def of(cls, scene: Scene, grid: Grid) -> DrawnView | None:
         """A view that can be drawn along with others; None for one that has to be drawn by itself.
 
         Its parts must be such as can be `Joint`, of few triangles, alike in their tables, all of one sampler. All
@@ -84,14 +84,14 @@ class View(NamedTuple):
 
 
 def _is_inside(seen: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
-    """True if vertices, as in `View.seen`, lie between the near and the far plane, and within a view of this size."""
+    """True if vertices, as in `DrawnView.seen`, lie between the near and the far plane, and within `size`."""
     z, w = (seen[:, 2] * row[2] + row[3] for row in camera.projection[2:])
     limits = 1 - 2 * MARGIN / np.array(size[::-1])
     whole = (w > 0).all() and (np.abs(z) <= w).all()
     return bool(whole and (np.abs(seen[:, :2]) <= limits * w[:, None]).all())
 
 
-def joined(views: Sequence[View], picture: Picture) -> tuple[Scene, Grid]:
+def joined(views: Sequence[DrawnView], picture: Picture) -> tuple[Scene, Grid]:
     """One scene of all parts, view after view, and the cells of the picture; its one `Joint` has all parts.
 
     The scene's parts have no transforms: only the joint tells where they are.

@@ -22,7 +22,7 @@ from rts.scene.camera import Camera
 
 
 @record(static=("size", "opaque"))
-class Picture:
+class DepthPicture:
     """The samples that a camera sees in front, and their planes; with `REACH` cells around the picture.
 
     Attributes:
@@ -52,7 +52,7 @@ class Seen:
         pictures: what is seen, in one picture or several. A point is seen if no picture hides it.
     """
 
-    pictures: tuple[Picture, ...]
+    pictures: tuple[DepthPicture, ...]
 
 
 def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
@@ -105,23 +105,23 @@ def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
 
 def picture_of(
     depth: Array, samples: Array, row: Array, camera: Camera, size: tuple[int, int], opaque: bool
-) -> Picture:
+) -> DepthPicture:
     """The picture of samples in their cells.
 
     Args:
         depth: (K, H, W) linear depth of the samples, without derivative.
-        samples: see `Picture`; one row may stand for all.
+        samples: see `DepthPicture`; one row may stand for all.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
         camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
-        opaque: see `Picture`.
+        opaque: see `DepthPicture`.
     """
     xp, lens = namespace(depth), _lens(stopped(camera), depth, size)
     of_layers = [depth_planes(depth[k, ...], row[k, ...], lens) for k in range(row.shape[0])]
     planes = of_layers[0][None, ...] if len(of_layers) == 1 else xp.stack(of_layers)
     if samples.shape[0] == 1:
         row = xp.clip(row, None, 0)
-    return Picture(camera, samples, row, planes, lens, size, opaque)
+    return DepthPicture(camera, samples, row, planes, lens, size, opaque)
 
 
 def _lens(camera: Camera, depth: Array, size: tuple[int, int]) -> Array:

@@ -16,12 +16,12 @@ from rts.outlines.of_scene import with_outlines
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, real_of
 from rts.sampling.picture import Picture
-from rts.sampling.side_by_side import View, joined
+from rts.sampling.side_by_side import DrawnView, joined
 from rts.sampling.tables import in_one_table
 from rts.views.sampled_views import Views, with_counts
 
 
-def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSettings) -> Views:
+def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: RenderSettings) -> Views:
     """The samples of views of one kind, and their outlines if the splatter reads these."""
     scene, grid = joined(views, picture)
     gradient = scene.context.engine.differentiates

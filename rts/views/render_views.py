@@ -24,7 +24,7 @@ from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
 from rts.sampling.picture import Picture, at_once
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.side_by_side import View
+from rts.sampling.side_by_side import DrawnView
 from rts.scene.camera import Camera
 from rts.splatting.channels import cropped_image
 from rts.views.joint_views import sampled_at_once
@@ -152,15 +152,15 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     return namespace(*images).stack(images)
 
 
-def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> View | None:
+def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> DrawnView | None:
     """The view of a scene that can be drawn along with others; None for one that has to be drawn by itself."""
     if settings.layers == "auto" or len(settings.bands(size)) > 1 or settings.capacity is not None:
         return None
     grid = Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron)
-    return View.of(scene, grid) if at_once(grid.size) > 1 else None
+    return DrawnView.of(scene, grid) if at_once(grid.size) > 1 else None
 
 
-def _drawn_at_once(views: Sequence[View], context: Context, settings: RenderSettings) -> Array:
+def _drawn_at_once(views: Sequence[DrawnView], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of views of one kind."""
     cells = views[0].grid.size
     chunks = _chunks(views, at_once(cells))

@@ -131,7 +131,7 @@ def outlines(
 ):
     """Fill `chord`, `edge` and `facing`: allowed distances of triangles from the surface, in units of space.
 
-    The view is a `View` of `rts_surfaces.patches.view_cells`. Out of a perspective view distances are infinite, and
+    The view is a `ViewCell` of `rts_surfaces.patches.view_cells`. Out of a perspective view distances are infinite, and
     `facing` is 0. No distance is below 1e-4 of the tile's radius.
 
     Args:

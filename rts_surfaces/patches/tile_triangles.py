@@ -11,7 +11,7 @@ from rts import InputError
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel
 from rts_surfaces.patches.tiles import CORNERS, MOST, Points, Tiles
-from rts_surfaces.patches.view_cells import View
+from rts_surfaces.patches.view_cells import ViewCell
 
 MOST_TRIANGLES = 2**27
 """The largest number of triangles; their arrays take 8 GiB."""
@@ -111,7 +111,7 @@ class Allowed(NamedTuple):
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
-def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> Allowed:
+def allowed_in(view: ViewCell, tile_shapes: Shapes, fine: float, coarse: float) -> Allowed:
     """The allowed distances of triangles from the surface in a view.
 
     Args:

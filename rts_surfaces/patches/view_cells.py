@@ -16,7 +16,7 @@ EVEN = 0.5
 """Views whose smallest scale of an axis is below this share of their largest have finer triangles."""
 
 
-class View(NamedTuple):
+class ViewCell(NamedTuple):
     """A cell of views, for which triangles are made: its middle, and the largest deviations of a view from it.
 
     Attributes:
@@ -66,17 +66,19 @@ def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple
     return False, _cell(off), _power(distance), _power(width * evenness), _cell(axis), _power(wide)
 
 
-def view_of(key: tuple, center: np.ndarray) -> View:
+def view_of(key: tuple, center: np.ndarray) -> ViewCell:
     """The cell of views with a key, the result of `view_key`, for a surface with this centre (3,)."""
     parallel, toward, distance, width, axis, wide = key
     direction, half = _direction(toward), 0.75 / CELLS  # Of a cell's diagonal, the tangent at most.
     narrow = STEP ** (width - 0.5)
     if parallel:
-        return View(direction, True, half, 0.0, direction, np.array([narrow, 0.0]), _direction(axis), math.pi)
+        return ViewCell(direction, True, half, 0.0, direction, np.array([narrow, 0.0]), _direction(axis), math.pi)
     length = STEP**distance
     angle = math.atan(STEP ** (wide + 0.5)) + half
     moves = length * half, length * math.log(STEP) / 2
-    return View(center + length * direction, False, *moves, direction, np.array([0.0, narrow]), _direction(axis), angle)
+    return ViewCell(
+        center + length * direction, False, *moves, direction, np.array([0.0, narrow]), _direction(axis), angle
+    )
 
 
 def _power(x: float) -> int:

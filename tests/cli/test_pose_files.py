@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import rts
 from rts.cli import main as cli
-from rts.cli.pose_file import Pose, posed, read_pose
+from rts.cli.pose_file import ModelPose, posed, read_pose
 from rts.cli.pose_verdict import intersection_over_union, judged, touches_border, unlike_a_mask
 from rts.errors import InputError
 from rts.scene.default_camera import bounds_of, orbit
@@ -32,7 +32,7 @@ def model(tmp_path):
 @pytest.fixture
 def pose(model):
     camera = orbit(bounds_of(rts.load(model)), (48, 64), 20, 10, 5.0, fov=35)
-    return Pose(np.asarray(rts.rigid(np.array([0.1, -0.2, 0.3, 0.1, 0, 0.2]))), camera, (48, 64))
+    return ModelPose(np.asarray(rts.rigid(np.array([0.1, -0.2, 0.3, 0.1, 0, 0.2]))), camera, (48, 64))
 
 
 def rectangle(top, bottom, left, right, size=(40, 40)):

@@ -50,7 +50,7 @@ def test_torch_is_asked_to_spin_for_microseconds_unless_it_came_first(first, the
     program = f"""
 import {first}, {then}, os
 from rts.diagnostics import profile
-text = str(profile.Profile((profile.Stage("splat", 1.0, 1.0, 1, 1.0),), 1, ""))
+text = str(profile.Profile((profile.StageTime("splat", 1.0, 1.0, 1, 1.0),), 1, ""))
 print(os.environ["OMP_WAIT_POLICY"], os.environ.get("GOMP_SPINCOUNT"), "Import rts first" in text)
 """
     names = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"

@@ -12,7 +12,7 @@ from rts.contracts.checks import is_real
 from rts.errors import InputError
 from rts.files.views.lenses import COEFFICIENTS, FISHEYE, Lens, check_model, checked_lens
 from rts.files.views.pictures import named_picture, picture_size, with_mask
-from rts.files.views.poses import Pose, entries, fitted, rigid
+from rts.files.views.poses import PosedPicture, entries, fitted, rigid
 
 CONTRADICTION = 1e-3
 """Largest difference, in widths of the image, of two statements of a file about one focal length."""
@@ -21,7 +21,7 @@ LEAST_ANGLE = 1e-9
 """The least field of view, radians: pixels per radian stay finite."""
 
 
-def blender(path: Path, tree: Mapping[str, Any], downscale: int) -> list[Pose]:
+def blender(path: Path, tree: Mapping[str, Any], downscale: int) -> list[PosedPicture]:
     """The entries of a file transforms_….json."""
     _check_angle(str(path), tree)
     poses = []
@@ -30,7 +30,7 @@ def blender(path: Path, tree: Mapping[str, Any], downscale: int) -> list[Pose]:
         picture = named_picture(path, place, frame["file_path"])
         size = picture_size(picture)
         lens, stated = _lens(place, frame, size)
-        pose = Pose(picture, picture.name, size, downscale, matrix, fitted(place, lens, stated, picture, size))
+        pose = PosedPicture(picture, picture.name, size, downscale, matrix, fitted(place, lens, stated, picture, size))
         mask = frame.get("mask_path")
         poses.append(with_mask(pose, None if mask is None else named_picture(path, place, mask)))
     return poses

@@ -9,9 +9,9 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
 from rts.files.paths import inside
-from rts.files.views.colmap_tables import Entry, Points, read_cameras, read_entries, read_points
+from rts.files.views.colmap_tables import ColmapImage, ColmapPoints, read_cameras, read_entries, read_points
 from rts.files.views.pictures import Folder, picture_folder, picture_size, with_mask
-from rts.files.views.poses import Pose, fitted, from_opencv
+from rts.files.views.poses import PosedPicture, fitted, from_opencv
 
 CAMERAS = ("cameras.bin", "cameras.txt")
 """Files of cameras; like COLMAP, of both forms the binary one is read."""
@@ -30,7 +30,7 @@ def cameras_in(folder: Path) -> Path | None:
     return None
 
 
-def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
+def colmap(path: Path, split: str | None, downscale: int) -> list[PosedPicture]:
     """The pictures of a COLMAP model, in the order of their names, given its file of cameras; None warns of "train"."""
     if split not in (None, "train", "test", "all"):
         raise InputError(f"split is {quoted(split)}; expected 'train', 'test' or 'all' for COLMAP, which has no others")
@@ -54,7 +54,7 @@ def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
         size = picture_size(picture)
         lens = fitted(f"{path}, camera {entry.camera}", lens, stated, picture, size)
         matrix, bounds = from_opencv(entry.rotation, entry.translation), _bounds(entry, points)
-        pose = Pose(picture, entry.name, size, folder.downscale, matrix, lens, *bounds)
+        pose = PosedPicture(picture, entry.name, size, folder.downscale, matrix, lens, *bounds)
         poses.append(with_mask(pose, folder.mask(entry.name), folder.reduced))
     if not any(pose.mask for pose in poses):
         _warn_of_other_masks(folder.masks, chosen[0].name)
@@ -83,7 +83,7 @@ def _root(model: Path) -> Path:
     return model.parent if model.name == "sparse" else model
 
 
-def _pictures(file: Path, folder: Folder, entries: list[Entry]) -> list[Path]:
+def _pictures(file: Path, folder: Folder, entries: list[ColmapImage]) -> list[Path]:
     """The pictures that are named; all that are missing make one error."""
     pictures = [inside(folder.pictures, entry.name, file, folder.pictures) for entry in entries]
     missing = [entry.name for entry, picture in zip(entries, pictures, strict=True) if not picture.is_file()]
@@ -107,7 +107,7 @@ def _warn_of_other_masks(folder: Path, name: str) -> None:
         )
 
 
-def _bounds(entry: Entry, points: Points | None) -> tuple[float | None, float | None]:
+def _bounds(entry: ColmapImage, points: ColmapPoints | None) -> tuple[float | None, float | None]:
     """Depths between which what is seen lies, by the points that the picture sees; None where it sees none."""
     if points is None:
         return None, None

@@ -27,7 +27,7 @@ KEYPOINT, SEEN = 24, 8
 """Bytes of a keypoint, and of an image that sees a point."""
 
 
-class Entry(NamedTuple):
+class ColmapImage(NamedTuple):
     """A picture: its name, the camera's number, its own, and the pose (R (3, 3), t (3,)) of world-to-camera."""
 
     image: int
@@ -37,7 +37,7 @@ class Entry(NamedTuple):
     translation: np.ndarray
 
 
-class Points(NamedTuple):
+class ColmapPoints(NamedTuple):
     """Points (N, 3), world, and which image sees which: numbers of images (M,), and rows of the points (M,)."""
 
     positions: np.ndarray
@@ -59,13 +59,13 @@ def read_cameras(path: Path) -> dict[int, tuple[Lens, tuple[int, int]]]:
     return cameras
 
 
-def read_entries(path: Path) -> list[Entry]:
+def read_entries(path: Path) -> list[ColmapImage]:
     """The pictures, in the file's order.
 
     Raises:
         InputError: the file is damaged, or a number or a name stands for two pictures.
     """
-    entries: dict[int, Entry] = {}
+    entries: dict[int, ColmapImage] = {}
     names: dict[str, int] = {}
     for number, pose, camera, name in (_binary_images if _is_binary(path) else _text_images)(path):
         place = f"{path}, image {number}"
@@ -79,11 +79,11 @@ def read_entries(path: Path) -> list[Entry]:
         length = float(np.linalg.norm(known[:4])) if (np.abs(known) <= LARGEST).all() else 0.0  # NaN is not.
         if length <= 1e-8:
             raise InputError(f"{place} has the pose {list(pose)}; expected a quaternion and a position")
-        entries[number] = Entry(number, camera, name, _rotation(known[:4] / length), known[4:])
+        entries[number] = ColmapImage(number, camera, name, _rotation(known[:4] / length), known[4:])
     return list(entries.values())
 
 
-def read_points(path: Path) -> Points:
+def read_points(path: Path) -> ColmapPoints:
     """The points, and the images that see them.
 
     Raises:
@@ -104,7 +104,7 @@ def read_points(path: Path) -> Points:
         )
     rows = np.repeat(np.arange(len(seen)), [len(images) for images in seen])
     images = np.concatenate(seen) if seen else np.zeros(0, np.int64)
-    return Points(positions, images, rows)
+    return ColmapPoints(positions, images, rows)
 
 
 def _refuse_repeated(place: str, number: int, known: Container[int]) -> None:

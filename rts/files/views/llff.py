@@ -12,7 +12,7 @@ from rts.errors import InputError
 from rts.files.damaged_files import contents
 from rts.files.views.lenses import Lens, checked_lens
 from rts.files.views.pictures import EXTENSIONS, picture_folder, picture_size, with_mask
-from rts.files.views.poses import LARGEST, Pose, fitted, rigid
+from rts.files.views.poses import LARGEST, PosedPicture, fitted, rigid
 
 SCALE_OF_NEAREST = 0.75
 """In NeRF's frame of LLFF data sets the nearest bound is 1 / 0.75."""
@@ -20,7 +20,7 @@ HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
 
 
-def llff(path: Path, downscale: int, frame: str) -> list[Pose]:
+def llff(path: Path, downscale: int, frame: str) -> list[PosedPicture]:
     """The entries of a file poses_bounds.npy, in the world of the file or in NeRF's."""
     rows = _rows(path)
     folder = picture_folder(path.parent, downscale, path)
@@ -45,7 +45,7 @@ def llff(path: Path, downscale: int, frame: str) -> list[Pose]:
         # Pixels stay square where sizes are rounded.
         focal *= size[1] / width
         lens = Lens(focal, focal, size[1] / 2, size[0] / 2)
-        pose = Pose(picture, picture.name, size, folder.downscale, c2w, lens, float(near), float(far))
+        pose = PosedPicture(picture, picture.name, size, folder.downscale, c2w, lens, float(near), float(far))
         poses.append(with_mask(pose, folder.mask(picture.name), folder.reduced))
     return _nerf_frame(poses) if frame == "nerf" else poses
 
@@ -67,7 +67,7 @@ def _rows(path: Path) -> np.ndarray:
     return rows
 
 
-def _nerf_frame(poses: list[Pose]) -> list[Pose]:
+def _nerf_frame(poses: list[PosedPicture]) -> list[PosedPicture]:
     """The poses relative to their mean, scaled so that the nearest bound is 1 / 0.75."""
     scale = 1 / (SCALE_OF_NEAREST * min(pose.near or math.inf for pose in poses))
     matrices = np.stack([pose.camera_to_world for pose in poses])

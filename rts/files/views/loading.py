@@ -21,7 +21,7 @@ from rts.files.views.colmap import CAMERAS, cameras_in, colmap
 from rts.files.views.llff import llff
 from rts.files.views.opencv_json import opencv
 from rts.files.views.pictures import read_mask, read_picture
-from rts.files.views.poses import Pose, read_json
+from rts.files.views.poses import PosedPicture, read_json
 from rts.rendering.arguments import ColorLike
 from rts.scene.camera import Camera
 from rts.scene.view import Reading, View
@@ -190,7 +190,7 @@ def _cameras_of_folder(path: Path, split: str) -> Path:
     return existing[0]
 
 
-def _poses(path: Path, split: str | None, downscale: int, frame: str) -> list[Pose]:
+def _poses(path: Path, split: str | None, downscale: int, frame: str) -> list[PosedPicture]:
     """The entries of a file of cameras."""
     kind = path.suffix.lower()
     if kind == ".npy":
@@ -204,7 +204,11 @@ def _poses(path: Path, split: str | None, downscale: int, frame: str) -> list[Po
 
 
 def _view(
-    pose: Pose, pixel_center: float, planes: tuple[float | None, float | None], image: Reading, mask: Reading | None
+    pose: PosedPicture,
+    pixel_center: float,
+    planes: tuple[float | None, float | None],
+    image: Reading,
+    mask: Reading | None,
 ) -> View:
     (height, width), n = pose.size, pose.downscale
     if height % n or width % n:

@@ -13,7 +13,7 @@ from rts.contracts.checks import is_count
 from rts.errors import InputError
 from rts.files.views.lenses import COEFFICIENTS, Lens, checked_lens
 from rts.files.views.pictures import named_picture, picture_size, with_mask
-from rts.files.views.poses import Pose, entries, fitted, from_opencv, numbers, rigid
+from rts.files.views.poses import PosedPicture, entries, fitted, from_opencv, numbers, rigid
 
 LENGTHS = (0,), (4,), (5,), (8,)
 """Numbers of OpenCV's coefficients that are followed; 12 and 14 are of thin prisms and tilted sensors."""
@@ -22,7 +22,7 @@ HALF = 0.5
 """The centre of the first pixel, which is (0, 0) in OpenCV, in pixels."""
 
 
-def opencv(path: Path, tree: Mapping[str, Any], downscale: int) -> list[Pose]:
+def opencv(path: Path, tree: Mapping[str, Any], downscale: int) -> list[PosedPicture]:
     """The entries of a JSON with views, each {image, K, R, t, distortion, fisheye, width, height, mask}."""
     poses = []
     for place, view in entries(path, tree, "views", "image", "K", "R", "t"):
@@ -31,7 +31,7 @@ def opencv(path: Path, tree: Mapping[str, Any], downscale: int) -> list[Pose]:
         picture = named_picture(path, place, view["image"])
         size = picture_size(picture)
         lens = fitted(place, _lens(place, view), _stated(place, view, size), picture, size)
-        pose = Pose(picture, picture.name, size, downscale, from_opencv(rotation, translation), lens)
+        pose = PosedPicture(picture, picture.name, size, downscale, from_opencv(rotation, translation), lens)
         mask = view.get("mask")
         poses.append(with_mask(pose, None if mask is None else named_picture(path, place, mask)))
     return poses

@@ -13,7 +13,7 @@ from rts.files.damaged_files import gathered, warn_once
 from rts.files.images import load_image, read_image
 from rts.files.paths import inside
 from rts.files.views.lenses import undistorted
-from rts.files.views.poses import Pose
+from rts.files.views.poses import PosedPicture
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
@@ -89,7 +89,7 @@ def named_picture(path: Path, place: str, name: object) -> Path:
     raise InputError(f"{place} refers to the picture {name[:60]!r}, but there is no such file, nor {name[:60]}.png")
 
 
-def with_mask(pose: Pose, mask: Path | None, reduced: int = 1) -> Pose:
+def with_mask(pose: PosedPicture, mask: Path | None, reduced: int = 1) -> PosedPicture:
     """The pose with a mask, which has the picture's size, or is `reduced` times as large; as it is if that is None.
 
     Raises:
@@ -106,7 +106,7 @@ def with_mask(pose: Pose, mask: Path | None, reduced: int = 1) -> Pose:
     return pose._replace(mask=mask, mask_size=size)
 
 
-def read_picture(pose: Pose, *, linear: bool, behind: np.ndarray | None) -> np.ndarray:
+def read_picture(pose: PosedPicture, *, linear: bool, behind: np.ndarray | None) -> np.ndarray:
     """(h, w, 4) float32 premultiplied of a picture, undistorted, then means of n × n pixels.
 
     Args:
@@ -131,7 +131,7 @@ def read_picture(pose: Pose, *, linear: bool, behind: np.ndarray | None) -> np.n
     return image if behind is None else image[..., :3] + (1 - image[..., 3:]) * behind
 
 
-def read_mask(pose: Pose) -> np.ndarray:
+def read_mask(pose: PosedPicture) -> np.ndarray:
     """(h, w) float32 in [0, 1]: the mask's picture, as encoded, or ones; times 0 where the lens leaves no picture."""
     from PIL import Image
 

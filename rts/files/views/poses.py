@@ -22,7 +22,7 @@ DIGITS = 18
 """Integers of so many digits fit into 64 bits."""
 
 
-class Pose(NamedTuple):
+class PosedPicture(NamedTuple):
     """A picture's entry in a file.
 
     Attributes:
