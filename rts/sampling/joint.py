@@ -158,20 +158,21 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
 
 
 def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
-    """Joints of some of neighbouring parts: those of few triangles, alike in their tables, and not mirrored."""
+    """Joints of some of neighbouring parts: those of few triangles, alike in their tables, and not culled and mirrored."""
     proxies, cameras = {}, {}
     for index in indices:
         proxies[index] = scene.entries[index].proxy
         cameras[index] = scene.local_camera(index, grid)
 
     def kind(index: int) -> tuple:
-        proxy, mirrored = proxies[index], np.linalg.det(cameras[index].view[:3, :3]) < 0
+        proxy = proxies[index]
+        mirrored = scene.parts[index].cull == "back" and np.linalg.det(cameras[index].view[:3, :3]) < 0
         tables = (None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params))
-        return 0 < len(proxy.faces) <= MOST, scene.parts[index].cull == "back" and mirrored, *tables
+        return 0 < len(proxy.faces) <= MOST and not mirrored, *tables
 
-    for (few, *_), run in itertools.groupby(indices, kind):
+    for (joins, *_), run in itertools.groupby(indices, kind):
         numbers = list(run)
-        if few and len(numbers) > 1:
+        if joins and len(numbers) > 1:
             yield Joint.of(scene, numbers[0], [proxies[i] for i in numbers], [cameras[i] for i in numbers])
 
 

@@ -123,6 +123,24 @@ def test_mirrored_and_large_parts_and_those_of_other_samplers_are_drawn_alone(si
     assert kinds_of(own) == [False, False, False, False, True, True]
 
 
+@pytest.mark.parametrize("mirrors", ["parts", "camera"])
+def test_neighbours_that_are_all_mirrored_show_the_sides_that_each_shows_alone(singly, mirrors):
+    transforms, parts = crowd(6, cull="back")
+    camera = CAMERA
+    if mirrors == "parts":
+        transforms[2:5, :3, :3] *= [-1, 1, 1]
+    else:
+        camera = CAMERA.replace(view=np.diag([-1.0, 1, 1, 1]) @ np.asarray(CAMERA.view))
+    own = parts(transforms)
+
+    def image():
+        return to_numpy(rts.render(own, camera, SIZE, engine="torch"))
+
+    np.testing.assert_allclose(image(), singly(image), rtol=0, atol=1e-5)
+    reference = to_numpy(rts.render(own, camera, SIZE, engine="torch", sampler="reference"))
+    np.testing.assert_allclose(image(), reference, rtol=0, atol=1e-4)
+
+
 def test_a_part_that_nothing_is_seen_of_keeps_a_row(singly):
     transforms, parts = crowd(5)
     transforms[1, :3, 3] += 100
