@@ -66,7 +66,7 @@ def judged(
     if iou < GOOD:
         hidden = "with a part of the mask hidden or wrong the pose may be right all the same (after.png); if not: "
         notes.append(
-            f"the model covers the mask with an IoU of {iou:.2f}; expected {GOOD} or more: "
+            f"the model covers the mask with an IoU of {iou:.3f}; expected {GOOD} or more: "
             f"{hidden if robust else ''}is it this model, "
             f"is its start (before.png) roughly right (--camera), and is the field of view (--fov, or --fit-fov)?"
         )

@@ -62,10 +62,8 @@ def _piece(
 ) -> Piece:
     """A primitive, in local space; refused if of an unfit mode, material or attribute. `name` is for errors."""
     mode = count_of(primitive.get("mode", 4))
-    if mode > 5:
-        raise gltf.fail(
-            f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)"
-        )
+    if mode > 6:
+        raise gltf.fail(f"{name} has mode {mode}; expected triangles (4), a strip (5) or a fan (6)")
     if mode in MODES:
         warn(f"{gltf.path}: {name} is of {MODES[mode]}, which are left out")
     if "material" in primitive and count_of(primitive["material"]) >= len(materials):
@@ -76,6 +74,8 @@ def _piece(
     if mode == 5:
         faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
         faces[1::2] = faces[1::2, ::-1]  # Every other triangle of a strip is turned over.
+    elif mode == 6:
+        faces = np.stack([np.broadcast_to(corners[:1], corners[2:].shape), corners[1:-1], corners[2:]], axis=1)
     faces = faces.reshape(-1, 3)
     attributes = {}
     if "NORMAL" in read:

@@ -20,7 +20,7 @@ from rts.arrays.trees import Array
 from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, InputError, PluginError
 from rts.files.bright_images import read_exr, read_hdr, write_exr, write_hdr
-from rts.files.damaged_files import Fail, gathered, warn_once
+from rts.files.damaged_files import Fail, gathered, warn, warn_once
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.shading.tone_mapping import check_exposure, tonemap
@@ -84,7 +84,7 @@ def load_image(path: Any) -> np.ndarray:
         PluginError: .exr without OpenEXR (extra `exr`).
 
     Warns:
-        FileWarning: Pillow found something wrong with it.
+        FileWarning: Pillow found something wrong with it; it is a photograph that is stored on its side, which stays.
     """
     path = as_path(path)
     if path.is_dir():
@@ -95,10 +95,24 @@ def load_image(path: Any) -> np.ndarray:
         return _bright(path)
     with gathered(path) as notes:
         encoded = read_image(path)
+        _warn_of_turns(path)
     warn_once(path, notes)
     straight = decode_srgb(encoded)
     alpha = straight[..., 3:] if straight.shape[2] == 4 else np.ones_like(straight[..., :1])
     return np.concatenate([straight[..., :3] * alpha, alpha], axis=2)
+
+
+def _warn_of_turns(path: Path) -> None:
+    """Warn of a picture that viewers turn upright, or mirror, by its EXIF data."""
+    from PIL import ExifTags, Image
+
+    with Image.open(path) as image:
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    if orientation != 1:
+        warn(
+            f"{path} is stored on its side or mirrored (EXIF orientation {orientation}), and is read as stored; "
+            f"PIL.ImageOps.exif_transpose turns it, for which a camera found from stored pixels is wrong"
+        )
 
 
 def _bright(path: Path) -> np.ndarray:

@@ -269,14 +269,15 @@ def read_obj(path: Path) -> list[Piece]:
     if forced:
         warn(f"{path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
     corners, owner = table[cut], of_face[owner]
+    _warn_of_gaps(path, table, sizes, of_face)
     pieces = []
     for name, index in lines.materials.items():
         if index not in used:
             continue
         faces, uv, normals = np.moveaxis(corners[owner == index], 2, 0)
         attributes: dict[str, Any] = {}
-        if (uv >= 0).all():
-            attributes["uv"] = (vt, uv)
+        if (uv >= 0).any():
+            attributes["uv"] = (np.concatenate([vt, np.zeros((1, 2))]), np.where(uv >= 0, uv, len(vt)))
         if (normals >= 0).all():
             attributes["normals"] = (vn, normals)
         colors = _colors(v)
@@ -286,14 +287,28 @@ def read_obj(path: Path) -> list[Piece]:
     return pieces
 
 
+def _warn_of_gaps(path: Path, table: np.ndarray, sizes: np.ndarray, of_face: np.ndarray) -> None:
+    """Warn of faces without texture coordinates or normals, of materials some of whose faces have them."""
+    lacks = np.logical_or.reduceat(table[:, 1:] < 0, np.cumsum(sizes) - sizes)
+    for column, result in ((0, "take (0, 0)"), (1, "leave their material without normals")):
+        own = lacks[:, column]
+        count = int(own[np.isin(of_face, of_face[~own])].sum())
+        if count:
+            what = ("texture coordinates", "normals")[column]
+            warn(f"{path}: {count} of {len(own)} faces have no {what}, and {result}")
+
+
 def _materials(lines: _Lines) -> dict[str | None, MtlMaterial]:
     """The materials of all libraries by name; a warning if a library, or a material that is used, is missing."""
     materials: dict[str | None, MtlMaterial] = {}
     complete = True
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
-        if library.is_file():
-            materials.update(read_mtl(library, lines.path.parent))
+        # A line may name several files, and a name may hold spaces.
+        several = [library] if library.is_file() else [inside(lines.path.parent, x, lines.path) for x in name.split()]
+        if several and all(file.is_file() for file in several):
+            for file in several:
+                materials.update(read_mtl(file, lines.path.parent))
         else:
             warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "

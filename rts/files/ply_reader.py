@@ -15,13 +15,20 @@ from rts.errors import InputError
 from rts.files.damaged_files import COUNT, Fail, is_plain, lines_of, unreadable, warn
 from rts.files.images import decoded
 from rts.files.model_pieces import Piece
-from rts.files.polygon_tables import Lists, PolygonTables, piece_of
+from rts.files.polygon_tables import COLORS, UV, Lists, PolygonTables, piece_of
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+
+OTHER_COLORS = tuple(f"diffuse_{name}" for name in COLORS), ("r", "g", "b", "a")
+"""Names that columns of red, green, blue and alpha have in some programs."""
+
+KNOWN = {*"xyz", "nx", "ny", "nz", *COLORS, *(name for names in UV for name in names)}
+KNOWN_OF_FACES = {"vertex_indices", "vertex_index", "texcoord", "texnumber", *COLORS}
+"""Columns that are read."""
 
 
 class Property(NamedTuple):
@@ -71,17 +78,24 @@ def read_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> Piece:
 
 
 def _mesh(path: Path, tables: dict[str, Columns], fail: Fail) -> PolygonTables:
-    vertex = {n: c for n, c in tables.get("vertex", {}).items() if isinstance(c, np.ndarray)}
+    columns = _plainly_named(tables.get("vertex", {}))
+    vertex = {n: c for n, c in columns.items() if isinstance(c, np.ndarray)}
     if not set("xyz") <= set(vertex):
         raise fail("it has no vertices with x, y and z")
-    face = tables.get("face")
+    unread = [name for name in columns if name not in vertex or name not in KNOWN]
     none = np.zeros(0, np.int64)
-    if face is None:
+    if "face" not in tables and "tristrips" in tables:
+        raise fail("it has strips of triangles, which are not read")
+    if "face" not in tables:
         return PolygonTables(vertex, (none, none), {})
+    face = _plainly_named(tables["face"])
     lists = {name: column for name, column in face.items() if isinstance(column, tuple)}
     named = [n for n in ("vertex_indices", "vertex_index") if n in lists] or list(lists)
     if not named:
         raise fail("its faces have no list vertex_indices")
+    unread += [name for name in face if name not in KNOWN_OF_FACES and name != named[0]]
+    if unread:
+        warn(f"{path} has properties that are not read: {', '.join(unread[:5])}{', …' if len(unread) > 5 else ''}")
     faces, (sizes, values) = lists[named[0]], lists.get("texcoord", (none, none))
     if faces[1].dtype.kind == "f":
         raise fail(f"the list {named[0]} is not of integers")
@@ -90,6 +104,15 @@ def _mesh(path: Path, tables: dict[str, Columns], fail: Fail) -> PolygonTables:
         warn(f"{path}: texcoord has not two numbers for each corner of each face; it is loaded without them")
     scalars = {name: column for name, column in face.items() if isinstance(column, np.ndarray)}
     return PolygonTables(vertex, faces, scalars, values.reshape(-1, 2) if len(values) and whole else None)
+
+
+def _plainly_named(columns: Columns) -> Columns:
+    """Columns by name, those of colours by the names of `COLORS`."""
+    for names in OTHER_COLORS:
+        if "red" not in columns and set(names[:3]) <= set(columns):
+            plain = dict(zip(names, COLORS, strict=True))
+            return {plain.get(name, name): column for name, column in columns.items()}
+    return columns
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:

@@ -19,6 +19,7 @@ from rts.cli import main as cli
 from rts.cli import pose_fit as pose
 from rts.errors import InputError, PluginError
 from rts.files import lit_models
+from rts.files.srgb import decode_srgb
 from rts.scene.default_camera import Bounds, bounds_of, orbit
 
 pytestmark = pytest.mark.files
@@ -570,6 +571,7 @@ def test_the_silhouette_is_the_alpha_or_else_the_brightness():
     image[0, 1, 3] = 1
     np.testing.assert_allclose(pose.silhouette_of(image), [[0.7, 1], [0, 0]], rtol=1e-6)
     image[..., 3] = 1
+    image[0, 0, :3] = decode_srgb(np.full(3, 0.7))  # A mask of 8 bits counts as it is written.
     np.testing.assert_allclose(pose.silhouette_of(image), [[0.7, 0], [0, 0]], rtol=1e-6)
 
 

@@ -183,7 +183,7 @@ def structure_changes():
     """Changes of meshes, scenes, extensions."""
     first = "meshes.0.primitives.0"
     for value in (0, 1, 2, 3, 5, 6, 7, -1, "4", 4.0, None):
-        reason = "a strip of the same indices is sound" if value == 5 else ""
+        reason = "a strip, or a fan, of the same indices is sound" if value in (5, 6) else ""
         yield f"mode {value!r}", _set(f"{first}.mode", value), reason
     for value in (0, 1, 3, 4, 5, 6, -1, "2", 2.0, None, True):
         reason = {5: _SHARED, None: GONE}.get(value if value is not True else -9, "")

@@ -135,8 +135,10 @@ def vertices_in(lines):
 
 
 ENDS = st.sampled_from(["\n", "\r\n"]), st.booleans()
+GAPS = pytest.mark.filterwarnings("ignore:.*faces have no (texture coordinates|normals)")
 
 
+@GAPS
 @MANY
 @given(obj=objs(), end=ENDS[0], last=ENDS[1])
 def test_an_obj_gives_its_triangles_however_it_is_written(folder, obj, end, last):
@@ -153,9 +155,12 @@ def test_an_obj_gives_its_triangles_however_it_is_written(folder, obj, end, last
             wanted = np.concatenate([expected["v"], expected[kind]], axis=2)
             assert as_set(np.concatenate(both)) == as_set(wanted)
         elif len(parts) == 1:
-            assert entry not in parts[0].theta
+            # Faces without uv take (0, 0) where others have some.
+            some = kind == "vt" and any(re.search(r"\d/-?\d", line) for line in lines if line.startswith("f"))
+            assert (entry in parts[0].theta) == some
 
 
+@GAPS
 @PROPERTIES
 @given(obj=objs(), end=ENDS[0], last=ENDS[1])
 def test_merged_or_not_welded_the_triangles_of_an_obj_are_the_same(folder, obj, end, last):
@@ -170,6 +175,7 @@ def test_merged_or_not_welded_the_triangles_of_an_obj_are_the_same(folder, obj, 
     assert as_set(np.concatenate(whole)) == as_set(expected["v"])
 
 
+@GAPS
 @PROPERTIES
 @given(obj=objs())
 def test_no_two_vertices_of_a_welded_mesh_are_the_same_and_all_are_used(folder, obj):

@@ -206,6 +206,73 @@ def test_an_obj_has_one_part_a_material(tmp_path):
     np.testing.assert_allclose(front_view(whole), front_view([b, a]), atol=1e-6)
 
 
+def test_faces_of_an_obj_without_uv_leave_others_theirs(tmp_path):
+    faces = "vn 0 0 1\nusemtl m\nf 1/1/1 2/2/1 3/3/1\nf 1 3 4\n"
+    textured_quad(tmp_path)
+    path = write(tmp_path / "m.obj", f"mtllib quad.mtl\n{QUAD}{QUAD_UV}{faces}")
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        [part] = rts.load(path, weld=False)
+    text = str(caught[0].message)
+    assert "1 of 2 faces have no texture coordinates, and take (0, 0)" in text
+    assert "1 of 2 faces have no normals, and leave their material without normals" in text
+    uv = part.theta["uv"][part.surface.indices.get("uv", part.surface.faces)]
+    np.testing.assert_allclose(uv, [[(0, 0), (1, 0), (1, 1)], [(0, 0)] * 3])
+    assert "normals" not in part.theta and "texture" in part.theta
+
+
+def test_an_obj_may_name_several_libraries_in_a_line(tmp_path):
+    write(tmp_path / "a.mtl", "newmtl a\nKd 1 0 0\n")
+    write(tmp_path / "b.mtl", "newmtl b\nKd 0 1 0\n")
+    path = write(tmp_path / "m.obj", f"mtllib a.mtl b.mtl\n{QUAD}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\n")
+    assert [part.theta["color"].tolist() for part in rts.load(path)] == [[1, 0, 0], [0, 1, 0]]
+
+
+ONE_FACE = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{}"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n{}3 0 1 2\n"
+)
+
+
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), "rgb"])
+def test_colors_of_a_ply_have_one_of_three_names(tmp_path, names):
+    columns = "".join(f"property uchar {name}\n" for name in names)
+    path = write(tmp_path / "m.ply", ONE_FACE.format(columns, "0 0 0 255 0 0\n1 0 0 0 255 0\n0 1 0 0 0 255\n"))
+    np.testing.assert_allclose(rts.load(path)[0].theta["colors"], np.eye(3))
+
+
+def test_properties_of_a_ply_that_are_not_read_are_named(tmp_path):
+    columns = "property float quality\nproperty uchar intensity\n"
+    path = write(tmp_path / "m.ply", ONE_FACE.format(columns, "0 0 0 1 1\n1 0 0 1 1\n0 1 0 1 1\n"))
+    with pytest.warns(rts.errors.FileWarning, match="properties that are not read: quality, intensity"):
+        rts.load(path)
+    strips = ONE_FACE.format("", "0 0 0\n1 0 0\n0 1 0\n").replace("element face", "element tristrips")
+    with pytest.raises(rts.InputError, match="strips of triangles, which are not read"):
+        rts.load(write(tmp_path / "s.ply", strips))
+
+
+def test_a_fan_of_a_gltf_turns_as_its_first_triangle_does(tmp_path):
+    values = np.ones((4, 4), np.float32)
+    path = gltf_with(tmp_path, "COLOR_0", values, 5126, "VEC4")
+    tree = json.loads(path.read_text())
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["mode"] = 6
+    del primitive["indices"]
+    [part] = rts.load(write(tmp_path / "fan.gltf", json.dumps(tree)), weld=False)
+    np.testing.assert_array_equal(part.surface.faces, GRID[1])
+
+
+def test_a_photograph_on_its_side_is_told(tmp_path):
+    image, exif = Image.new("RGB", (6, 4)), Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "turned.jpg", exif=exif)
+    image.save(tmp_path / "upright.jpg")
+    with pytest.warns(rts.errors.FileWarning, match="EXIF orientation 6"):
+        assert rts.load_image(tmp_path / "turned.jpg").shape == (4, 6, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rts.load_image(tmp_path / "upright.jpg")
+
+
 def test_textures_are_linear_and_their_alpha_makes_the_shader_translucent(tmp_path):
     path = textured_quad(tmp_path)
     Image.fromarray(np.full((2, 2, 4), (128, 255, 0, 51), np.uint8)).save(tmp_path / "tex.png")
