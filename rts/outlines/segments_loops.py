@@ -23,6 +23,13 @@ CLOSE = 1e-4
 """Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
 
 
+ALIKE = 1e-6
+"""Distance, in cells, of two breaks that are in one place."""
+
+MOST_ALIKE = 4
+"""The most breaks in one place: a centre is the end of so many gaps."""
+
+
 @loop
 def ends_of(gap, place, near, parts, height, width):
     """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
@@ -180,7 +187,7 @@ def segments_of(order, group, square, ends, place, tangent, width):
             ties[found, 1], square_sides[found, 1] = sorted_ends[other, 0], sorted_ends[other, 1]
         found += 1
     ties = ties[:found]
-    return origin[:found], ties, square_sides[:found], _beyond(ties, len(place))
+    return origin[:found], ties, square_sides[:found], _beyond(ties, place)
 
 
 @loop
@@ -197,13 +204,14 @@ def ending(near, parts, triangles):
 
 
 @compiled
-def _beyond(ties, count):
+def _beyond(ties, place):
     """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
 
-    `ties` (S, 2) are the ends of segments, between `count` breaks; each break ends at most two.
+    Of breaks in one place, which an outline has that passes through a centre, one counts. `ties` (S, 2) are the ends of
+    segments, between breaks at `place` (B, 2); each break ends at most two.
     """
     # The segments at each break, as 2 · segment + end.
-    at = np.full((count, 2), -1, np.int32)
+    at = np.full((len(place), 2), -1, np.int32)
     for s in range(len(ties)):
         for e in range(2):
             b = ties[s, e]
@@ -213,15 +221,19 @@ def _beyond(ties, count):
     for s in range(len(ties)):
         for e in range(2):
             tie = 2 * s + e
-            for far in range(2):
+            far = 0
+            for _ in range(2 * MOST_ALIKE):
                 b = ties[tie // 2, tie % 2]
-                if b < 0:
+                if b < 0 or far == 2:
                     break
                 next_ = at[b, 1] if at[b, 0] == tie else at[b, 0]
                 if next_ < 0:
                     break
                 tie = next_ + 1 - 2 * (next_ % 2)  # Its other end.
-                found[s, (1 - far) if e == 0 else 2 + far] = ties[tie // 2, tie % 2]
+                c = ties[tie // 2, tie % 2]
+                if c < 0 or abs(place[c, 0] - place[b, 0]) + abs(place[c, 1] - place[b, 1]) > ALIKE:
+                    found[s, (1 - far) if e == 0 else 2 + far] = c
+                    far += 1
     return found
 
 
@@ -265,9 +277,9 @@ def _inward(tangent, side):
 
 @compiled
 def _within(point, origin, s):
-    """True if a point lies in the square of a segment."""
+    """True if a point lies in the square of a segment, or `CLOSE` to it: a vertex may lie on a side, or at a centre."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
-    return 0 <= x <= 1 and 0 <= y <= 1
+    return -CLOSE <= x <= 1 + CLOSE and -CLOSE <= y <= 1 + CLOSE
 
 
 @loop
@@ -331,4 +343,5 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         pull[s, 0], pull[s, 3] = -lines * on / 2, -lines * back / 2
         pull[s, 1] = (1 - lines) * (1 - share) + lines * (1 + on) / 2
         pull[s, 2] = (1 - lines) * share + lines * (1 + back) / 2
-        corner[s, 0], corner[s, 1] = x - (origin[s, 1] + 0.5), y - (origin[s, 0] + 0.5)
+        corner[s, 0] = min(max(x - (origin[s, 1] + 0.5), 0.0), 1.0)
+        corner[s, 1] = min(max(y - (origin[s, 0] + 0.5), 0.0), 1.0)

@@ -158,7 +158,7 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
 
 
 def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
-    """Joints of some of neighbouring parts: those of few triangles, alike in their tables, and not culled and mirrored."""
+    """Joints of some neighbouring parts: of few triangles, alike in their tables, and not both culled and mirrored."""
     proxies, cameras = {}, {}
     for index in indices:
         proxies[index] = scene.entries[index].proxy

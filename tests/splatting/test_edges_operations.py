@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cards import SIZE, SQUARE, in_pixels, turned, two_colors
+from cards import SIZE, SQUARE, card, flat, in_pixels, turned, two_colors
 from helpers import box, icosphere
 
 import rts
@@ -47,6 +47,12 @@ def wave(theta, points):
     return xp.abs(points[:, 0]) + xp.abs(points[:, 2]) + 0.2 * points[:, 1] ** 2 - theta["radius"]
 
 
+def diamond():
+    """A square on its corner, whose sides pass through centres."""
+    corners = 12 + 8 * np.array([(1.0, 0), (0, 1), (-1, 0), (0, -1)])
+    return [card(flat(corners), (0.3, 0.9, 0.5))]
+
+
 def field():
     return [rts.Part(rts.Sdf(wave, 1.6), {"radius": np.float32(0.7)}, "lambert")]
 
@@ -54,6 +60,7 @@ def field():
 NEAR = rts.Camera.look_at((0.5, 0.7, 3.0), (0, 0, 0), fov_y=40)
 SCENES = {
     "cards": (two_colors, in_pixels(), SIZE),
+    "a diamond": (diamond, in_pixels(), SIZE),
     "bodies": (bodies, NEAR, (14, 17)),
     "a field": (field, NEAR, (16, 15)),
     "panes": (panes, in_pixels(), SIZE),

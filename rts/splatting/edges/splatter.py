@@ -366,8 +366,12 @@ class _Segments(NamedTuple):
         """(S,) True where a corner lies on the right of the way: clockwise between the end and the start."""
         # Clockwise, corner k begins side k, so all that lies on sides from k on comes after it.
         start, end = self.square_sides[:, 0] >= k, self.square_sides[:, 1] >= k
-        places = self._places()
-        return namespace(start).where(places[0] < places[1], start | ~end, start & ~end)
+        return namespace(start).where(self._clockwise(), start | ~end, start & ~end)
+
+    def _clockwise(self) -> Array:
+        """(S,) True where the end comes after the start on the square's sides; these meet in corners."""
+        (start, end), sides = self._places(), self.square_sides
+        return (start < end) | ((start == end) & (sides[:, 0] < sides[:, 1]))
 
     def _right_of_bottom(self, low: float, high: float) -> Array:
         """(S,) the length, between two places on the square's sides, of what lies on the right of the way."""
@@ -376,7 +380,7 @@ class _Segments(NamedTuple):
         def between(a: Array, b: Array) -> Array:
             return xp.clip(xp.clip(b, low, high) - xp.clip(a, low, high), 0.0, None)
 
-        return xp.where(start < end, high - low - between(start, end), between(end, start))
+        return xp.where(self._clockwise(), high - low - between(start, end), between(end, start))
 
     def _pieces(self) -> list[tuple[Array, Array, Array]]:
         """Middles (S, 2), ways (S, 2) and fluxes (S, C) of straight pieces of segments, cut where pixels meet."""

@@ -84,11 +84,11 @@ def _place(x, y, side):
 
 
 @compiled
-def _right_of_bottom(start, end, low, high):
+def _right_of_bottom(start, end, clockwise, low, high):
     """The length, between two places on the sides, of what lies on the right of the way from `start` to `end`."""
-    a, b = (start, end) if start < end else (end, start)
+    a, b = (start, end) if clockwise else (end, start)
     between = max(min(max(b, low), high) - min(max(a, low), high), 0.0)
-    return high - low - between if start < end else between
+    return high - low - between if clockwise else between
 
 
 @compiled
@@ -195,8 +195,10 @@ def weigh_segments(
         turn = (path[s, 1, 0] - path[s, 0, 0]) * chord_x + (path[s, 1, 1] - path[s, 0, 1]) * chord_y
         turn = turn / length if length > 0 else 0.0
         start, end = _place(path[s, 0, 0], path[s, 0, 1], side0), _place(path[s, 2, 0], path[s, 2, 1], side1)
-        area[0] = area[3] = 0.5 * _right_of_bottom(start, end, 2.5, 3.0)
-        area[1] = area[2] = 0.5 * _right_of_bottom(start, end, 2.0, 2.5)
+        # Two sides meet in a corner, which an outline may pass through.
+        clockwise = start < end or (start == end and side0 < side1)
+        area[0] = area[3] = 0.5 * _right_of_bottom(start, end, clockwise, 2.5, 3.0)
+        area[1] = area[2] = 0.5 * _right_of_bottom(start, end, clockwise, 2.0, 2.5)
         for i in range(2):
             x, y = path[s, i, 0], path[s, i, 1]
             wx, wy = path[s, i + 1, 0] - x, path[s, i + 1, 1] - y
@@ -217,7 +219,7 @@ def weigh_segments(
         for k in range(4):
             # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
             after, until = side0 >= k, side1 >= k
-            on_right = (after or not until) if start < end else (after and not until)
+            on_right = (after or not until) if clockwise else (after and not until)
             counts = not lone or side0 == k or side0 == (k + 3) % 4
             beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
             share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
