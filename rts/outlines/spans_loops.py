@@ -205,9 +205,10 @@ def _add(t, on_line, least, most, gap, line, corners, names, spans, count):
     `on_line` are the first gap, the one after the last, and the column of `gap` that tells where they begin.
     """
     first, last, column = on_line
-    for g in range(first, last):
+    for g in range(first, last if most - least > TINY else first):
         start, end = least - 0.5 - gap[g, column], most - 0.5 - gap[g, column]
-        if min(end, 1.0) - max(start, 0.0) > TINY:
+        # Those that touch it count, since a layer may end at a centre.
+        if min(end, 1.0) - max(start, 0.0) >= -TINY:
             names[count, 0], names[count, 1] = g, t
             _fill(spans, count, start, end, line, corners, gap[g, column] + 0.5)
             count += 1
