@@ -58,16 +58,20 @@ def _holds(kind: type, name: str) -> tuple[bool, Any]:
 
 @functools.lru_cache(maxsize=1024)
 def check_members(kind: type[Plugin]) -> None:
-    """Refuse a class that overrides a final method, or has a function named almost like an optional method.
+    """Refuse a class that overrides a final method, has a value for a method, or a function named almost like one.
 
     Names are almost alike if one letter is added, left out or exchanged; functions of bases in other packages may have
     such names. Optional methods belong to the library's abstract classes. Each class is checked once.
 
     Raises:
-        PluginError: the class has such a function.
+        PluginError: the class has such a value or function.
     """
     bases = [c for c in kind.__mro__ if inspect.isabstract(c) and c.__module__.partition(".")[0] == "rts"]
     members = {n: f for c in reversed(bases) for n, f in vars(c).items() if isinstance(f, FunctionType) and n[0] != "_"}
+    for c in (c for c in kind.__mro__ if c not in bases):
+        for name, value in vars(c).items():
+            if name in members and not callable(value) and not hasattr(value, "__get__"):
+                raise PluginError(f"{c.__qualname__} has the value {value!r} for {name!r}; expected a method")
     functions = [(c, n) for c in kind.__mro__ if c not in bases for n, f in vars(c).items() if type(f) is FunctionType]
     there = {name for _, name in functions}
     lacked = [n for n, f in members.items() if n not in there and not getattr(f, "__isabstractmethod__", False)]

@@ -44,11 +44,14 @@ class Rays(Sampler):
         hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)
         depth = near + hits.distance
         hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far), (layers, *size))
+        lost = xp.any(hits.hit & (hits.distance != hits.distance))
 
         every, capacity = layers * size[0] * size[1], request.capacity
         rows = every if capacity is None else capacity
 
-        def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
+        def pack(hit: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, ...]:
+            if lost.any():
+                raise InputError(f"intersect of {surface!r} gave distances that are NaN, of rays that hit")
             hits = np.flatnonzero(hit)
             row = np.full(every, -1, np.int32)
             row[hits[:rows]] = np.arange(min(rows, len(hits)), dtype=np.int32)
@@ -58,7 +61,7 @@ class Rays(Sampler):
 
         packed = ArraySpec((rows,), np.int32, packed=capacity is None)
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
-        index, row, overflow = engine.call_host(pack, specs, hit)
+        index, row, overflow = engine.call_host(pack, specs, hit, lost)
         width_i, width_p = surface.hit_widths or surface.sample_widths
         params = xp.take(xp.reshape(hits.params, (every, width_p)), index, axis=0)
         if hits.ids is None:

@@ -13,7 +13,6 @@ import itertools
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -25,12 +24,6 @@ TASKS_PER_THREAD = 4
 
 LITTLE_WORK = 100_000
 """Nanoseconds of work for which one more thread is woken, which takes tens of thousands, and the interpreter lock."""
-
-LATE = max(5e-4, time.get_clock_info("thread_time").resolution)
-"""Seconds by which the caller waits longer for helpers than they worked, from which on they rest."""
-
-REST = 20
-"""How many times as long they rest. Other programs have the cores then, and each loop would wait for its turn."""
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -55,13 +48,11 @@ class _Job:
         cores: the cores of the caller's thread; None if the system does not know them.
         roams: whether the work may run on all of these cores, the caller's current one included.
         error: the error that the work raised, or None.
-        worked: the time that a processor spent on the work, seconds.
     """
 
     def __init__(self, work: Callable[[], None], allowed: set[int] | None, roams: bool):
         self.work, self.cores, self.roams = work, allowed, roams
         self.error: BaseException | None = None
-        self.worked = 0.0
         self._unclaimed, self._going = threading.Lock(), threading.Lock()
         self._going.acquire()
 
@@ -77,13 +68,11 @@ class _Job:
         return mine
 
     def run(self) -> None:
-        """Do the work, and keep its error and how long it took."""
-        start = time.thread_time()
+        """Do the work, and keep its error."""
         try:
             self.work()
         except BaseException as error:
             self.error = error
-        self.worked = time.thread_time() - start
 
     def end(self) -> None:
         """Release the one thread that waits for the job, now or later."""
@@ -102,20 +91,14 @@ class _Helpers:
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
         self._under_way: set[_Job] = set()
         self._lock = threading.Lock()
-        self._rest_until = 0.0
         # The system's numbers of the threads; of those that run anywhere now; and the cores of the others.
         self._threads: list[int] = []
         self._roaming: set[int] = set()
         self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
-        """The number of helpers, out of `count`, that are idle or not started yet; 0 while they rest."""
-        return 0 if time.perf_counter() < self._rest_until else max(0, count - len(self._under_way))
-
-    def waited(self, seconds: float, worked: float) -> None:
-        """Be told how long a caller waited for helpers, and how long they worked; if that was `LATE`, they rest."""
-        if seconds - worked > LATE:
-            self._rest_until = time.perf_counter() + REST * (seconds - worked)
+        """The number of helpers, out of `count`, that are idle or not started yet; at least 0."""
+        return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:
         """Start helpers until there are `count`, or as many as the system gives."""
@@ -264,11 +247,9 @@ def parallel(loop: Callable, count: int, *args: Any, work: int | None = None, of
         share()
     finally:
         # Whatever happens, no helper may still write to arrays when the caller returns.
-        begun, start = [job for job in jobs if not job.withdraw()], time.perf_counter()
+        begun = [job for job in jobs if not job.withdraw()]
         for job in begun:
             job.wait()
-    if off_caller_core:
-        _helpers.waited(time.perf_counter() - start, sum(job.worked for job in begun))
     for job in jobs:
         if job.error is not None:
             raise job.error

@@ -60,6 +60,8 @@ def check_splatter(splatter: Any) -> Splatter:
     splatter = checked_plugin(registry.instance("rts.splatters", splatter), "the splatter", Splatter)
     if not is_count(splatter.reach):
         raise InputError(f"reach of {splatter!r} is {splatter.reach!r}; expected cells, an integer of at least 1")
+    if splatter.layers is not None and not is_count(splatter.layers):
+        raise InputError(f"layers of {splatter!r} is {splatter.layers!r}; expected an integer of at least 1, or None")
     return splatter
 
 

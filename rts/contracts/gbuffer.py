@@ -26,6 +26,13 @@ class GBuffer(dict):
         self._deferred: dict[str, Callable[[], Any]] = {}
         self._units: dict[str, tuple[Any, Any]] = {}
         self._like = None
+        self._check: Callable[[str, Any], None] | None = None
+
+    def check(self, check: Callable[[str, Any], None]) -> None:
+        """Check all attributes by `check(name, attribute)`, deferred ones once they are computed."""
+        self._check = check
+        for name, value in self.computed.items():
+            check(name, value)
 
     @property
     def like(self) -> Any:
@@ -61,7 +68,10 @@ class GBuffer(dict):
                 f"the shader reads {name!r}, but the surface provides {', '.join(map(repr, self))}; "
                 f"add the attribute to the part's theta or choose another shader"
             )
-        self[name] = value = self._deferred[name]()
+        value = self._deferred[name]()
+        if self._check is not None:
+            self._check(name, value)
+        self[name] = value
         self._deferred.pop(name, None)
         return value
 

@@ -36,8 +36,9 @@ class Residuals(Plugin):
         """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
 
         W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
-        U is the number of numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All three are arrays of
-        the parameters' engine, perhaps traced. A class with this method spares Levenberg–Marquardt the Jacobian.
+        U is the number of numbers in the parameters, in the order of `rts.plugin_api.arrays.leaves`. All three are
+        arrays of the parameters' engine, perhaps traced. A class with this method spares Levenberg–Marquardt the
+        Jacobian.
         """
         raise NotImplementedError
 

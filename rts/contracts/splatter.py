@@ -44,7 +44,8 @@ class Splatter(Plugin):
 
     def cropped(self, splats: Splats) -> Array:
         """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy."""
-        return without_border(self.image(splats), splats.border)
+        image = self.image(splats)
+        return without_border(image, splats.border) if len(shape_of(image)) == 3 else image  # Refused later.
 
     @final
     def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0, opaque: bool = True) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.argument_checks import quoted
 from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree
 from rts.contracts.residuals import Residuals
@@ -38,11 +39,17 @@ class Terms:
     ):
         self.residuals, self._engine, self._checked = residuals, engine, checked
         self.several = overrides(residuals, "draw", Residuals)
+        missing = [name for name in ("load", "of") if self.several and not overrides(residuals, name, Residuals)]
+        if missing:
+            raise InputError(f"{residuals!r} has draw without {' and '.join(missing)}; terms need all three")
         self._processes = processes if self.several else None
 
     def unchecked(self, data: Tree) -> Residuals:
         """Residuals of one term, as they were given."""
-        return self.residuals.of(data) if self.several else self.residuals
+        term = self.residuals.of(data) if self.several else self.residuals
+        if not callable(term):
+            raise InputError(f"of of {self.residuals!r} gave {quoted(term)}; expected residuals of one term")
+        return term
 
     def of(self, data: Tree) -> Callable[[Tree], Array]:
         """Residuals of one term, whose results are checked."""
@@ -61,7 +68,10 @@ class Terms:
         """Keys of the terms that count at a step; None for all."""
         if not self.several:
             return [None]
-        keys = list(self.residuals.draw(step))
+        keys: Any = self.residuals.draw(step)
+        if not isinstance(keys, Iterable) or isinstance(keys, str):
+            raise InputError(f"draw of {self.residuals!r} gave {quoted(keys)}; expected a list of keys of terms")
+        keys = list(keys)
         if not keys:
             raise InputError(f"residuals drew no term at step {step}; expected at least one")
         return keys

@@ -52,20 +52,25 @@ def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int,
     traced = any(map(is_traced, operands))
     if not traced and not any(map(is_batched, operands)):
         return None
-    return _Call(scene, grid, request, layers, told, values, traced).sampled()
+    return _Call(scene, grid, request, layers, told, values, traced).sampled(operands)
 
 
 class _Call:
-    """A call to the host: its operands, the shapes of its results, and what it computes.
+    """A call to the host: the shapes of its results, and what it computes from operands.
 
     Args are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
+    Programs keep the call, which must not keep what was traced.
     """
 
     def __init__(self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool):
-        self._scene, self._grid, self._layers, self._told, self._values = scene, grid, layers, told, values
+        parts = [replace(part, theta={}, transform=None) for part in scene.parts]
+        self._context = Context(engine_of(), np.zeros((), real_of(scene)))
+        self._scene, self._size = scene._replace(parts=parts, cameras=[], context=self._context), grid.size
+        self._layers, self._told = layers, told
+        self._values = map_leaves(lambda x: x if type(x) is np.ndarray else 0.0, values)
         self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)
         self._most = most_breaks(grid, request.capacity) if traced else None
-        self._context, kept = Context(engine_of(), np.zeros((), real_of(scene))), 1 if all(scene.opaque) else layers
+        kept = 1 if all(scene.opaque) else layers
         cells = 1 if request.uniform else layers * grid.size[0] * grid.size[1]
         beside = (self._most or 0) * told.samples(layers)
         rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
@@ -81,9 +86,8 @@ class _Call:
         self._outlines = _specs(self._most or 0, grid.size, real_of(scene), kept)
         self._cells = kept, *grid.size
 
-    def sampled(self) -> Sampled:
-        """The samples, in arrays of the scene's engine."""
-        operands = [x for x in leaves(self._values) if type(x) is not np.ndarray]
+    def sampled(self, operands: Sequence[Array]) -> Sampled:
+        """The samples, in arrays of the operands' engine."""
         engine = engine_of(*operands)
         results = iter(engine.call_host(OnAllCores(self._one, self._several), self._specs(), *operands))
         samples, lengths = [], []
@@ -119,7 +123,7 @@ class _Call:
         """The scene on the host, and its cells, from operands."""
         values = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), self._values)
-        return from_values(self._scene, self._grid.size, known)
+        return from_values(self._scene, self._size, known)
 
     def _one(self, *arrays: np.ndarray) -> list[np.ndarray]:
         """The results of one item."""
@@ -136,7 +140,7 @@ class _Call:
         for index, view in enumerate(views):
             if view is not None:
                 kinds.setdefault(view.kind, []).append(index)
-        most, found = at_once(self._grid.size), {}
+        most, found = at_once(self._size), {}
         for alike in kinds.values():
             for first in range(0, len(alike), most):
                 chunk = alike[first : first + most]
@@ -150,7 +154,7 @@ class _Call:
 
     def _side_by_side(self, views: Sequence[DrawnView]) -> Iterator[Sampled]:
         """The samples of each of several views of one kind, drawn in one picture."""
-        picture = Picture.of(len(views), self._grid.size)
+        picture = Picture.of(len(views), self._size)
         scene, grid = joined(views, picture)
         request = self._request
         sampled = scene.joints[0].sampled(picture.size, self._layers, request.triangles, request.uniform)

@@ -9,14 +9,14 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-from rts.arrays.array_functions import described, kind_of, shape_of
+from rts.arrays.array_functions import kind_of
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import Context, is_constant
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
-from rts.contracts.result_checks import check_shaded
+from rts.contracts.result_checks import check_attribute, check_shaded
 from rts.errors import InputError
 from rts.rendering.part_transforms import OneTransform, ViewTransforms
 from rts.scene.camera import Camera
@@ -43,15 +43,17 @@ def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
         if samples.gbuffer_names is None or (wanted is not None and set(wanted) <= set(samples.gbuffer_names)):
-            return GBuffer(samples.gbuffer)
+            return _checked(GBuffer(samples.gbuffer), part, samples)
     gbuffer = part.surface.evaluate(context.constants(theta), samples)
     if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
         what = f"one with {sorted(gbuffer)}" if isinstance(gbuffer, Mapping) else kind_of(gbuffer)
         raise InputError(f"evaluate of {part.surface!r} gave {what}; expected an rts.GBuffer with 'position'")
-    gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
-    if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
-        position = described(gbuffer["position"])
-        raise InputError(f"'position' of {part.surface!r} {position}; expected ({samples.ids.shape[0]}, 3)")
+    return _checked(gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer), part, samples)
+
+
+def _checked(gbuffer: GBuffer, part: CheckedPart, samples: Samples) -> GBuffer:
+    """A G-buffer of a part whose attributes are refused where they are wrong."""
+    gbuffer.check(partial(check_attribute, part.surface, samples.ids.shape[0]))
     return gbuffer
 
 

@@ -95,7 +95,7 @@ class TriangleSampler(Sampler):
             cull: "none", or "back" to ignore triangles whose normal (counter-clockwise winding) faces away.
 
         Returns:
-            Fragments, front to back in each pixel; no layer follows an empty one.
+            Fragments in new arrays, front to back in each pixel; no layer follows an empty one.
         """
 
     def rasterize_points(

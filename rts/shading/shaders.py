@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import dot, shape_of
+from rts.arrays.array_functions import described, dot, shape_of
 from rts.arrays.engines import engine_of, is_constant, namespace, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
@@ -150,8 +150,11 @@ class Unlit(Shader):
                 base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
             yield base
         if "color" in gbuffer:
-            check_base("the surface's 'color'", gbuffer["color"])
-            yield gbuffer["color"]
+            base = gbuffer["color"]
+            if base.shape[1] not in (1, 3, 4):
+                raise InputError(f"the surface's 'color' {described(base)}; expected 1, 3 or 4 columns")
+            check_base("the surface's 'color'", base)
+            yield base
 
     def looked_up(self, texture: Array, gbuffer: GBuffer) -> Array:
         """A texture (h, w, C) at the samples (N, C), with the options of this shader."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rts import registry
-from rts.arrays.trees import Tree, map_leaves
+from rts.arrays.engine_base import Engine
+from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.records import Proxy
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
@@ -14,7 +15,7 @@ from rts.sampling.packing import pack_fragments
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
-from rts.testing.claims import claim, claim_finite
+from rts.testing.claims import claim, claim_finite, no_error
 from rts.testing.proxy_claims import inputs_of
 from rts.testing.sample_claims import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
@@ -97,6 +98,23 @@ def _rays_of(part: Part, camera: Camera) -> tuple[Tree, np.ndarray, np.ndarray]:
     directions = rays.directions.reshape(-1, 3).astype(np.float32)
     origins = (rays.origins.reshape(-1, 3) + float(local.depth_range()[0]) * directions).astype(np.float32)
     return map_leaves(derivatives.single, part.theta), origins, directions
+
+
+def claim_compiled(part: Part, surface: RaySurface, engine: Engine) -> None:
+    """Fail unless a compiled call hits with the same rays, all but a share `FEW`."""
+    theta, origins, directions = _rays_of(part, scenes.CAMERA)
+    expected = np.asarray(surface.intersect(theta, origins, directions, LAYERS).hit)
+    values, join = derivatives.split(part.theta)
+
+    def hit(x: list, start: Array, way: Array) -> Array:
+        return surface.intersect(derivatives.joined(engine, join, x), start, way, LAYERS).hit
+
+    with no_error(f"intersect compiled by {engine.name}"):
+        found = engine.to_numpy(engine.jit(hit)(*derivatives.on(engine, (values, origins, directions))))
+    wrong = int((found != expected).sum())
+    claim(
+        wrong <= FEW * expected.size, f"intersect compiled by {engine.name} differs at {wrong} of {expected.size} hits"
+    )
 
 
 def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:

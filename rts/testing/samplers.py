@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays.trees import leaves
+from rts.arrays.trees import Tree, leaves, map_leaves
 from rts.contracts.checks import check_sampler
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Request, Sampled
@@ -109,7 +109,7 @@ class SamplerConformance(Conformance):
     # -------------------------------------------------------------------------------------- the contract
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
-        """Two calls agree to the last bit; parts with new θ on the same surfaces, sampled in between, are right."""
+        """Two calls agree to the last bit; parts with new θ, sampled in between, are right; results stay."""
         scaled_parts = [_scaled(part, 0.9) for part in parts]
         expected = [right(part, scenes.AXES[2], sampler) for part in scaled_parts]
         silhouettes = Silhouettes()
@@ -120,6 +120,11 @@ class SamplerConformance(Conformance):
                 silhouettes += claim_like(sampled, like, f"part {i} with new arrays in θ, after {view}")
             _claim_same(scenes.find(part, camera, sampler), first, view)
         silhouettes.claim_few("with new arrays in θ, ")
+        chosen, part, request = check_sampler(sampler), scenes.checked(parts[0]), Request(triangles=True)
+        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, scenes.LAYERS, request)
+        kept = map_leaves(np.array, found)
+        chosen.sample(part, scenes.AXES[2], scenes.SIZE, scenes.LAYERS, request)
+        _claim_same(found, kept, "samples", "a later call has changed their arrays; give new ones each time")
 
     def test_prepared_parts_are_sampled_alike(self, sampler: Any, parts: list[Part]) -> None:
         """Data that `rts.prepare` builds once for a part give the right samples, wherever the part is moved."""
@@ -311,7 +316,8 @@ def _scenes(parts: list[Part]) -> list[tuple[str, Camera, Part]]:
     return [(f"part {i}, {view}", c, p) for i, p in enumerate(parts) for view, c in scenes.VIEWS.items()]
 
 
-def _claim_same(actual: Sampled, expected: Sampled, view: str) -> None:
+def _claim_same(
+    actual: Tree, expected: Tree, view: str, fault: str = "the same call gives other samples after another one"
+) -> None:
     pairs = zip(leaves(actual), leaves(expected), strict=True)
-    same = all(np.array_equal(a, b) for a, b in pairs)
-    claim(same, f"{view}: the same call gives other samples after another one")
+    claim(all(np.array_equal(a, b) for a, b in pairs), f"{view}: {fault}")

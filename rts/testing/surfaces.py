@@ -11,6 +11,7 @@ from rts.arrays.engines import engine_of
 from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
+from rts.contracts.result_checks import WIDTHS
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
@@ -21,7 +22,13 @@ from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating
 from rts.testing.motion_claims import claim_followed, claim_inputs_change
 from rts.testing.normal_claims import claim_upright
 from rts.testing.proxy_claims import claim_corners, claim_keys_tell_views, triangles_of
-from rts.testing.refine_claims import claim_found_again, claim_found_from_behind, claim_misses_dropped, claim_refined
+from rts.testing.refine_claims import (
+    claim_compiled,
+    claim_found_again,
+    claim_found_from_behind,
+    claim_misses_dropped,
+    claim_refined,
+)
 from rts.testing.sample_claims import claim_ordered, claim_reprojected
 from rts.testing.tessellation_claims import claim_rates, claim_tessellated
 
@@ -83,6 +90,14 @@ class SurfaceConformance(Conformance):
         for view, camera in scenes.VIEWS.items():
             claim_found_from_behind(part, surface, camera, view)
 
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_intersect_can_be_compiled(self, part: Part, engine: str) -> None:
+        """`intersect` can be traced, as it looks at no values: rays of a compiled call hit where NumPy's do."""
+        surface = scenes.checked(part).surface
+        if not isinstance(surface, RaySurface):
+            pytest.skip("the surface does not intersect rays itself")
+        claim_compiled(part, surface, differentiating(engine))
+
     def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
         """Two renders agree to the last bit, despite others in between; changes of arrays in place are seen."""
         values, join = split(part.theta)
@@ -111,7 +126,7 @@ class SurfaceConformance(Conformance):
                 gbuffer = _evaluated(part, _single(part.theta), some)
             claim("position" in gbuffer, f"the G-buffer has {sorted(gbuffer)}; 'position' is missing")
             for name, value in gbuffer.items():
-                expected = len(some.ids), 3 if name in ("position", "normal") else value.shape[-1]
+                expected = len(some.ids), WIDTHS.get(name, value.shape[-1])
                 claim(value.shape == expected, f"{name!r} has shape {value.shape}; expected {expected}")
                 claim(value.dtype == np.float32, f"{name!r} is {value.dtype} where θ is float32; expected float32")
                 claim_finite(value, f"{name!r} of {kind} samples")

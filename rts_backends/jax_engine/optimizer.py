@@ -22,11 +22,23 @@ class Optimizer:
         method: "adam", "sgd", or an `optax.GradientTransformation`.
         rates: the learning rate, or a list of one for each array, for a method by name.
         parameters: where to start.
+
+    Raises:
+        InputError: the transformation needs more than parameters and gradients, such as the loss.
     """
 
     def __init__(self, method: str | optax.GradientTransformation, rates: float | Sequence[float], parameters: Tree):
         transform: Any = {"adam": optax.adam, "sgd": optax.sgd}[method](1.0) if isinstance(method, str) else method
         self._state = transform.init(parameters)
+        try:
+            jax.eval_shape(transform.update, parameters, self._state, parameters)
+        except TypeError as error:
+            if "keyword-only" not in str(error):
+                raise
+            raise InputError(
+                f"method, an optax transformation, needs more than the gradient ({error}), as optax.lbfgs and "
+                "optax.polyak_sgd do; give one that does not, such as optax.adam(1e-2), or 'lm'"
+            ) from error
 
         @jax.jit
         def update(parameters: Tree, gradient: Tree, state: Any) -> tuple[Tree, Any]:

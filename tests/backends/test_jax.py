@@ -62,6 +62,19 @@ def test_jit_keeps_image_and_gradient(jax, scene):
     assert_trees_close(to_numpy(found), plain_gradient("jax"))
 
 
+def test_programs_keep_nothing_that_was_traced(jax):
+    faces, vertices = np.array([(0, 1, 2)]), np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+
+    def total(pose):
+        part = Part(rts.Mesh(faces), {"vertices": vertices}, "lambert", transform=rts.rigid(pose))
+        return rts.render(part, camera, (9, 8)).sum()
+
+    with jax.check_tracer_leaks(True):
+        gradient = jax.jit(jax.grad(total))(jax.numpy.full(6, 0.01))
+    assert np.isfinite(np.asarray(gradient)).all()
+
+
 def test_jit_with_enough_capacity_keeps_the_image_and_counts_no_overflow(jax, scene):
     part, camera = part_of(scene), camera_at(scene["eye"])
     covered = int((rts.sample(part, camera, SIZE, layers=2).row >= 0).sum())

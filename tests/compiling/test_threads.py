@@ -169,44 +169,6 @@ def test_only_as_many_threads_are_asked_as_there_is_work_for(monkeypatch, helper
     assert len(asked) == 1  # The caller's thread has the other range.
 
 
-def test_helpers_that_other_programs_hold_up_rest(monkeypatch, helpers):
-    from rts.compiling import threads
-
-    monkeypatch.setenv("RTS_NUM_THREADS", "2")
-    monkeypatch.setattr(threads, "REST", 5)
-    caller, slept, found = threading.get_ident(), 0.02, []
-
-    def run(nap):
-        """True if a helper has worked, whose share takes `nap` seconds in which no processor works for it."""
-        both, idents = threading.Barrier(2), set()
-
-        def loop(start, stop):
-            if start in (0, 1) and helped:
-                both.wait(30)  # Each of the two threads has one of these.
-                time.sleep(nap if threading.get_ident() != caller else 0)
-            idents.add(threading.get_ident())
-
-        helped = helpers.free(1) == 1
-        threads.parallel(loop, 9)
-        return len(idents) == 2
-
-    for nap in (0.0, 0.0, slept, 0.0, 0.0):
-        found.append(run(nap))
-    assert found == [True, True, True, False, False]
-    time.sleep(5 * slept)
-    assert run(0.0)
-
-
-def test_helpers_rest_only_if_the_caller_would_have_been_faster_alone(helpers):
-    from rts.compiling import threads
-
-    for waited, worked in ((0.0, 0.0), (0.03, 0.04), (0.04, 0.04 - threads.LATE / 2)):
-        helpers.waited(waited, worked)
-        assert helpers.free(3) == 3
-    helpers.waited(0.04, 0.01)
-    assert helpers.free(3) == 0
-
-
 def cores_of_helper(monkeypatch, run):
     """The core of the caller of `run`, given a function of a range, and the cores on which its helper may run."""
     from rts.compiling import threads

@@ -367,3 +367,10 @@ def test_a_full_disk_leaves_the_last_checkpoint_and_the_fit_goes_on(tmp_path, mo
         fit = rts.fit(Lines(), start(), steps=12, checkpoint=path, checkpoint_every=3)
     assert fit.steps == 12 and path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
+
+
+def test_an_optimiser_of_optax_that_wants_the_loss_is_refused():
+    optax, jnp = pytest.importorskip("optax"), pytest.importorskip("jax").numpy
+    for method in (optax.lbfgs(), optax.polyak_sgd()):
+        with pytest.raises(rts.InputError, match="needs more than the gradient .*'value'"):
+            rts.fit(lambda x: x - 1, jnp.zeros(3), method=method, steps=2)

@@ -193,6 +193,82 @@ def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, 
         show(part, **options)
 
 
+def test_a_value_in_place_of_a_method_is_refused():
+    kind = type("Valued", (Ellipsoid,), {"reads": ("center",)})
+    with pytest.raises(
+        rts.errors.PluginError, match=r"Valued has the value \('center',\) for 'reads'; expected a method"
+    ):
+        show(rts.Part(kind(), BALL), sampler="rays")
+
+
+ATTRIBUTES = {
+    "two columns": ("normal", lambda x: x[:, :2]),
+    "integers": ("normal", lambda x: x.astype(np.int32)),
+    "one dimension": ("normal", lambda x: x[:, 0]),
+    "half the rows": ("normal", lambda x: x[: len(x) // 2]),
+    "a list": ("normal", lambda x: x.tolist()),
+    "three coordinates": ("uv", lambda x: x),
+    "two colours": ("color", lambda x: x[:, :2]),
+}
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+@pytest.mark.parametrize("fault", ATTRIBUTES)
+def test_an_attribute_of_a_wrong_shape_is_refused_by_its_name(fault, deferred):
+    name, change = ATTRIBUTES[fault]
+
+    class Odd(MESH):
+        def evaluate(self, theta, samples):
+            gbuffer = super().evaluate(theta, samples)
+            if deferred:
+                gbuffer.defer(name, lambda: change(gbuffer["position"]))
+            else:
+                gbuffer[name] = change(gbuffer["position"])
+            return gbuffer
+
+    vertices, faces = icosphere(1)
+    theta = {"vertices": vertices}
+    if name == "uv":
+        theta["texture"] = np.ones((2, 2, 3), np.float32)
+    part = rts.Part(Odd(faces), theta, "textured" if name == "uv" else "lambert")
+    with pytest.raises(rts.InputError, match=f"'{name}'.* (has shape|is a list).*; expected"):
+        show(part)
+
+
+@pytest.mark.parametrize("layers", [0, "all", 1.5])
+def test_layers_of_a_splatter_are_a_count(layers):
+    splatter = type("Odd", (splatting.Plain,), {"layers": layers})()
+    with pytest.raises(rts.InputError, match="layers of .* is .*; expected an integer of at least 1, or None"):
+        show(mesh_part(icosphere(0)), splatter=splatter)
+
+
+@pytest.mark.parametrize("result", [None, 1.0, np.zeros((3, 4))])
+def test_a_splatter_that_gives_no_image_is_told(result):
+    splatter = type("Odd", (splatting.Plain,), {"image": lambda self, splats: result})()
+    with pytest.raises(rts.InputError, match="the image of .*Odd.*; expected"):
+        show(mesh_part(icosphere(0)), splatter=splatter)
+
+
+def test_terms_of_residuals_have_three_methods():
+    class Terms(rts.Residuals):
+        def __call__(self, parameters):
+            return parameters
+
+        def draw(self, step):
+            return [0]
+
+    torch = pytest.importorskip("torch")
+    with pytest.raises(rts.InputError, match="has draw without load and of; terms need all three"):
+        rts.fit(Terms(), torch.zeros(2), steps=1)
+    own = {"load": lambda self, key: {}, "of": lambda self, data: self}
+    for name, change, expected in (
+        ("draw", lambda self, step: 3, "draw of .* gave 3; expected a list of keys"),
+        ("of", lambda self, data: None, "of of .* gave None; expected residuals of one term"),
+    ):
+        with pytest.raises(rts.InputError, match=expected):
+            rts.fit(type("Odd", (Terms,), {**own, name: change})(), torch.zeros(2), steps=1)
+
+
 def test_an_update_without_a_prepare_is_refused_where_a_sampler_is_made():
     own = {"update": method, "rasterize": method}
     refused = "^Lone has an update, .* and no prepare; write prepare, or leave update"

@@ -316,7 +316,10 @@ NUMBERS = """
 ACCEPTED = {
     "None": OPTIONAL.split(),
     "a fraction": NUMBERS.split(),
-    "minus one": ["from_opencv.pixel_center", "Isosurface.isovalue"],
+    "minus one": [
+        *("from_opencv.pixel_center", "Isosurface.isovalue"),
+        *("shader.specular", "shader.shininess", "shader.ambient"),
+    ],
     "an empty list": ["Isosurface.reads"],
     "a list of words": ["Isosurface.reads"],
     "infinity": ["fit.tolerance"],

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers import FRONT
+from helpers import FRONT, arrays, to_numpy
 
+import rts
 from rts import Camera, GBuffer, InputError
 from rts.shading.environment import _looked_up
 from rts.shading.pbr import Pbr
@@ -100,6 +101,19 @@ def test_specular_is_what_dielectrics_reflect_at_most_all(specular):
         expected = np.pi * LAMP["color"] * brdf(points, toward, direction, metallic, 0.4, dielectric)
         found = shaded(points, metallic, 0.4, LAMP, specular=specular)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch-cpu", "jax"])
+def test_whole_numbers_of_python_are_numbers_of_materials_and_lights(kind):
+    part = rts.plugin("surfaces", "mesh").example()
+    camera = Camera.look_at((0, 1, 4), (0, 0, 0))
+    entries = arrays(kind, dict(part.theta))
+
+    def image(one, two):
+        theta = entries | {"metallic": one, "roughness": one, "light": {"direction": (0, two, 0), "ambient": two}}
+        return to_numpy(rts.render(part.replace(theta=theta, shader="pbr"), camera, (9, 12)))
+
+    np.testing.assert_array_equal(image(1, 2), image(1.0, 2.0))
 
 
 @pytest.mark.parametrize("metallic, roughness", [g for g in GRID if g[1] >= 0.2])
