@@ -48,4 +48,5 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
     filled = origin, ties, square_sides, around, *known, triangle, corner, pull
     parallel(loops.corners, len(ties), *filled, work=150 * len(ties))
+    loops.meet(origin, ties, square_sides, *known, corner)
     return Segments(origin, ties, square_sides, np.ascontiguousarray(around[:, 1:3]), corner, pull)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.contracts.records import ON_NEXT, ON_PREVIOUS
 
 LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND = 2.0, 1.5, 0.5, 1.0
 """Costs, in cells, beside the length of segments: a break that stays alone; a segment between two breaks on one side,
@@ -345,3 +346,45 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         pull[s, 2] = (1 - lines) * share + lines * (1 + back) / 2
         corner[s, 0] = min(max(x - (origin[s, 1] + 0.5), 0.0), 1.0)
         corner[s, 1] = min(max(y - (origin[s, 0] + 0.5), 0.0), 1.0)
+
+
+@compiled
+def _in_one_square(origin, s, t):
+    """True if two segments, of which the second may be beyond the list, are in one square."""
+    return 0 <= t < len(origin) and origin[s, 0] == origin[t, 0] and origin[s, 1] == origin[t, 1]
+
+
+@compiled
+def _towards(start, way, a, b):
+    """Where a line from a point along a direction meets the straight piece from a to b; its distance, or infinite."""
+    piece, off = _minus(b, a), _minus(a, start)
+    turn = way[0] * piece[1] - way[1] * piece[0]
+    if turn == 0:
+        return a, np.inf
+    distance, t = (off[0] * piece[1] - off[1] * piece[0]) / turn, (off[0] * way[1] - off[1] * way[0]) / turn
+    return (a[0] + t * piece[0], a[1] + t * piece[1]), distance if distance >= 0 and 0 <= t <= 1 else np.inf
+
+
+@loop
+def meet(origin, ties, square_sides, place, tangent, corner):
+    """Let a break that is alone beside one segment in its square end there: fill in its second side, and its corner.
+
+    Its outline is hidden by what the segment bounds. It goes on along its tangent, or else to the segment's corner.
+    Arguments are as of `corners`.
+    """
+    for s in range(len(ties)):
+        other = s - 1 if _in_one_square(origin, s, s - 1) else s + 1
+        beyond = 2 * s - other
+        if ties[s, 1] >= 0 or not _in_one_square(origin, s, other) or _in_one_square(origin, s, beyond):
+            continue
+        if ties[other, 1] < 0 or _in_one_square(origin, s, 2 * other - s):
+            continue
+        left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
+        start, middle = _row(place, ties[s, 0]), (corner[other, 0] + left, corner[other, 1] + top)
+        way, meeting, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), middle, np.inf
+        for e in range(2):
+            there, distance = _towards(start, way, _row(place, ties[other, e]), middle)
+            if distance < nearest:
+                meeting, nearest = there, distance
+        square_sides[s, 1] = ON_PREVIOUS if other < s else ON_NEXT
+        corner[s, 0], corner[s, 1] = min(max(meeting[0] - left, 0.0), 1.0), min(max(meeting[1] - top, 0.0), 1.0)

@@ -218,8 +218,8 @@ def test_glass_that_lets_no_light_through_is_drawn_as_opaque():
         return drawn([pane(near, 3, RED, alpha, t, (1.0, 0, 0)), pane(far, 4, GREEN, alpha)])
 
     (image, derivative), (glass, pushed_glass) = (pushed(lambda t, a=a: scene(t, a)) for a in (1.0, 0.9999))
-    # Where an edge ends behind another surface, one pixel is off by about an eighth.
-    assert np.sort(np.abs(glass - image).max(-1).ravel())[-13] < 1e-3
+    # Where outlines cross, pixels of glass are off by about a tenth.
+    assert np.sort(np.abs(glass - image).max(-1).ravel())[-15] < 1e-3
     assert np.linalg.norm(pushed_glass - derivative) < 0.05 * np.linalg.norm(derivative)
 
 

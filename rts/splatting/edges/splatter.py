@@ -20,6 +20,7 @@ Where light passes through, C and the colours on both sides of a break are compo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ import numpy as np
 from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, floating_bits, namespace, stopped
 from rts.arrays.trees import Array, collected, map_leaves
-from rts.contracts.records import ArraySpec, Outlines, Splats
+from rts.contracts.records import ON_NEXT, ON_PREVIOUS, ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
 from rts.plugin_base import overrides
@@ -146,7 +147,11 @@ def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array, bo
         return without_border(image, border)
     breaks = _Breaks.of(outlines, positions, rgba)
     segments = _Segments.of(outlines, breaks)
-    parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts(color)]
+    parts = [
+        *_beside_breaks(breaks, segments, outlines, color, motion),
+        *segments.parts(color),
+        *segments.meetings(color),
+    ]
     cells = xp.concat([y * width + x for x, y, _ in parts])
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
@@ -237,6 +242,8 @@ class _Breaks(NamedTuple):
 class _Segments(NamedTuple):
     """Segments, each from a break to another; or from a lone break straight across its square, of which half counts.
 
+    The outline of a lone break may also end at another segment, behind its surface. Then three outlines meet there.
+
     Attributes:
         square: (S, 2) int, x and y of the first corner's cell.
         lone: (S,) bool.
@@ -249,6 +256,9 @@ class _Segments(NamedTuple):
         next: (4, 2, S) int, the side of the breaks, 0 or 1, that a corner of the square is next to, or −1.
         seen: (2, S, 2) bool, is there a sample on these sides?
         moves: (3, S, 2), the motion of start, corner and end.
+        given: (S, 2), `Outlines.corner`.
+        hidden: (S,) bool, does a lone break's outline end at another segment? There is `given`.
+        meets: (S,) int, the hidden segment that ends at each, or −1.
     """
 
     square: Array
@@ -262,11 +272,19 @@ class _Segments(NamedTuple):
     next: Array
     seen: Array
     moves: Array
+    given: Array
+    hidden: Array
+    meets: Array
 
     @classmethod
     def of(cls, outlines: Outlines, breaks: _Breaks) -> _Segments:
         """The segments between breaks."""
         xp, side = namespace(breaks.place), outlines.square_sides
+        alone, number = outlines.ties[:, 1] < 0, engine_of(side).arange(side.shape[0], outlines.corner)
+        hidden, number = alone & (side[:, 1] >= 0), xp.astype(number, side.dtype)
+        earlier = xp.roll(alone & (side[:, 1] == ON_NEXT), 1, axis=0)
+        later = xp.roll(alone & (side[:, 1] == ON_PREVIOUS), -1, axis=0)
+        meets = xp.where(later, number + 1, xp.where(earlier, number - 1, -1))
         lone, first = outlines.ties[:, 1] < 0, outlines.ties[:, 0]
         ties = xp.stack([first, xp.where(lone, first, outlines.ties[:, 1])], axis=-1)
         side = xp.stack([side[:, 0], xp.where(lone, (side[:, 0] + 2) % 4, side[:, 1])], axis=-1)
@@ -298,7 +316,7 @@ class _Segments(NamedTuple):
         moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
         path = xp.stack([start, corner, end])
         sides = xp.stack(jump), xp.stack(right), xp.stack(turned), beside, seen
-        return cls(square, lone, path, side, ties, *sides, xp.stack(moves))
+        return cls(square, lone, path, side, ties, *sides, xp.stack(moves), outlines.corner, hidden, meets)
 
     def parts(self, color: Array) -> list[tuple[Array, Array, Array]]:
         """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
@@ -329,9 +347,63 @@ class _Segments(NamedTuple):
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
             differs = xp.where(self._knows(k, on_right)[:, None], centre - (beside[0] + beside[1]) / 2, 0.0)
             change = change + share * mean - xp.abs(share) * differs
-            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone
+            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone | self.hidden | (self.meets >= 0)
             parts.append((x, y, xp.where(nothing[:, None], 0.0, change)))
         return parts
+
+    def meetings(self, color: Array) -> list[tuple[Array, Array, Array]]:
+        """Changes as of `parts`, of segments at which another one ends, and of these.
+
+        Three outlines go from their breaks to a point, and three surfaces lie between them. Clockwise around the
+        square, the colour rises by a jump at each break; what is on the way from there to the point counts against it.
+        """
+        xp, parts, rays = namespace(self.path), [], self._rays()
+        there, other = self.meets >= 0, xp.where(self.meets >= 0, self.meets, 0)
+        flat = xp.reshape(color, (-1, color.shape[2]))
+        for k, (dx, dy) in enumerate(CORNERS):
+            change, ends, x, y = 0.0, [], self.square[:, 0] + dx, self.square[:, 1] + dy
+            for e, ray in enumerate(rays):
+                weight, flux = ray.onto(k)
+                counts = there | self.hidden if e == 0 else there
+                change = change + xp.where(counts[:, None], flux - weight[:, None] * ray.jump, 0.0)
+                ends.append((ray, weight, self.next[k, e], self.seen[e]))
+            ray, weight, next_, seen = ends[0]
+            hidden = (xp.take(x, other, axis=0) for x in (*ray.around(), weight, next_, seen))
+            around = [(*ray.around(), *own) for ray, *own in ends] + [tuple(hidden)]
+            keyed = [(side < k, place, side, *rest) for place, side, *rest in around]
+            before, after = _farthest(xp, keyed, 1), _farthest(xp, keyed, -1)
+            known = xp.zeros_like(there)
+            fails = xp.zeros_like(there)
+            for clockwise, (_, _, side, _, _, _, next_, seen) in ((True, before), (False, after)):
+                expected = xp.where((side < 2) == clockwise, 1, 0)
+                known = known | (next_ == expected)
+                fails = fails | (next_ == 1 - expected) | ~xp.where(expected == 0, seen[:, 0], seen[:, 1])
+            beside = (before[4] + after[3]) / 2
+            centre = xp.take(flat, y * color.shape[1] + x, axis=0)
+            lost = xp.clip(after[5] - before[5], 0.0, None)
+            own = xp.where(there & known & ~fails, lost, 0.0)[:, None] * (centre - beside)
+            parts.append((x, y, change - own))
+        return parts
+
+    def _rays(self) -> list[_Ray]:
+        """The outlines from start and end of each segment to where it meets another; only the first of hidden ones."""
+        xp = namespace(self.path)
+        there, other = (self.meets >= 0)[:, None], xp.where(self.meets >= 0, self.meets, 0)
+        at = xp.where(there, xp.take(self.given, other, axis=0), self.given)
+        (first, near), (second, far) = (_along(self.path[i], self.given, at) for i in (0, 2))
+        starts = near <= far
+        t, own = xp.where(starts, first, second)[:, None], xp.where(starts[:, None], self.moves[0], self.moves[2])
+        moved, rays = (1 - t) * own + t * self.moves[1], []
+        for e, straight in enumerate((self.hidden | starts, ~starts)):
+            start, move, straight = self.path[2 * e], self.moves[2 * e], straight[:, None]
+            end = xp.where(self.hidden[:, None], move, moved)
+            points = xp.stack([start, xp.where(straight, (start + at) / 2, self.given), at])
+            moves = xp.stack([move, xp.where(straight, (move + end) / 2, self.moves[1]), end])
+            side, jump = self.square_sides[:, e], (self.jump[0] if e == 0 else -self.jump[1])
+            left = self.right[e] - self.jump[e]
+            after, before = (left, self.right[e]) if e == 0 else (self.right[e], left)
+            rays.append(_Ray(points, moves, jump, side, self._places()[e], before, after))
+        return rays
 
     def _knows(self, k: int, on_right: Array) -> Array:
         """(S,) True where the segment's side towards a corner is the surface that is seen at this corner."""
@@ -389,26 +461,99 @@ class _Segments(NamedTuple):
         length = xp.sum(chord * chord, axis=-1)
         turn = xp.sum((self.path[1] - self.path[0]) * chord, axis=-1) / xp.where(length > 0, length, 1.0)
         shares = xp.zeros_like(turn), turn, xp.ones_like(turn)
-        for i in (0, 1):
-            start, way = self.path[i], self.path[i + 1] - self.path[i]
-            cuts = []
-            for a in (0, 1):
-                there = xp.abs(way[:, a]) > 1e-9
-                cuts.append(xp.where(there, (0.5 - start[:, a]) / xp.where(there, way[:, a], 1.0), 0.0))
-            first, last = xp.zeros_like(turn), xp.ones_like(turn)
-            cuts = [xp.clip(c, 0.0, 1.0) for c in (xp.minimum(*cuts), xp.maximum(*cuts))]
-            bounds = [first, *cuts, last]
-            for low, high in zip(bounds[:-1], bounds[1:], strict=True):
-                t = ((low + high) / 2)[:, None]
-                at, piece = start + t * way, (high - low)[:, None] * way
-                u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
-                moves, jumps = (1 - t) * self.moves[i] + t * self.moves[i + 1], (1 - u) * jump[0] + u * jump[1]
-                flux = moves[:, 0] * piece[:, 1] - moves[:, 1] * piece[:, 0]
-                # A lone break's edge ends amid the square.
-                beside = xp.sum(xp.abs(at - self.path[0]), axis=-1) <= 0.5
-                flux = xp.where(self.lone & ~beside, 0.0, flux)
-                pieces.append((at, piece, flux[:, None] * jumps))
+        for at, way, moves, (i, t) in _cut(self.path, self.moves):
+            u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
+            flux = moves[:, 0] * way[:, 1] - moves[:, 1] * way[:, 0]
+            # A lone break's edge ends amid the square.
+            beside = xp.sum(xp.abs(at - self.path[0]), axis=-1) <= 0.5
+            flux = xp.where(self.lone & ~beside, 0.0, flux)
+            pieces.append((at, way, flux[:, None] * ((1 - u) * jump[0] + u * jump[1])))
         return pieces
+
+
+class _Ray(NamedTuple):
+    """Outlines from breaks on sides of squares to points inside where they meet others.
+
+    Attributes:
+        points: (3, S, 2), the break, a point between, and the end.
+        moves: (3, S, 2), their motions.
+        jump: (S, C), the colour on the right of the way less that on the left.
+        side: (S,) the side of the square.
+        place: (S,) the place of the break on the sides, clockwise.
+        before: (S, C), the colour before it, clockwise.
+        after: (S, C), the colour after it.
+    """
+
+    points: Array
+    moves: Array
+    jump: Array
+    side: Array
+    place: Array
+    before: Array
+    after: Array
+
+    def around(self) -> tuple[Array, Array, Array, Array]:
+        """Place, side, and the colours before and after the break."""
+        return self.place, self.side, self.before, self.after
+
+    def onto(self, k: int) -> tuple[Array, Array]:
+        """By how much the colour of the quarter at corner k rises with the jump, clockwise (S,); the flux (S, C)."""
+        xp, (dx, dy), jump = namespace(self.points), CORNERS[k], stopped(self.jump)
+        low, place = 2.0 if dx else 2.5, self.place
+        weight = 0.5 * xp.clip(low + 0.5 - xp.clip(place, low, None), 0.0, None)
+        weight = weight - 0.25 * xp.astype(self.side < k, place.dtype)
+        flux = xp.zeros_like(jump)
+        for at, way, moves, _ in _cut(self.points, self.moves):
+            column = at[:, 0] >= 0.5 if dx else at[:, 0] < 0.5
+            height = xp.clip(at[:, 1] - 0.5 * dy, 0.0, 0.5)
+            weight = weight + xp.where(column, height * way[:, 0], 0.0)
+            right, below = (xp.clip((at[:, a] - 0.5) / BORDER + 0.5, 0.0, 1.0) for a in (0, 1))
+            share = (right if dx else 1 - right) * (below if dy else 1 - below)
+            rate = moves[:, 0] * way[:, 1] - moves[:, 1] * way[:, 0]
+            flux = flux + (share * rate)[:, None] * jump
+        return weight, flux
+
+
+def _cut(points: Array, motions: Array) -> list[tuple[Array, Array, Array, tuple[int, Array]]]:
+    """Straight pieces of paths (3, S, 2), cut where pixels meet: middles, ways, motions (S, 2); places on the path."""
+    xp, pieces = namespace(points), []
+    for i in (0, 1):
+        start, way = points[i], points[i + 1] - points[i]
+        cuts = []
+        for a in (0, 1):
+            there = xp.abs(way[:, a]) > 1e-9
+            cuts.append(xp.where(there, (0.5 - start[:, a]) / xp.where(there, way[:, a], 1.0), 0.0))
+        cuts = [xp.clip(c, 0.0, 1.0) for c in (xp.minimum(*cuts), xp.maximum(*cuts))]
+        bounds = [xp.zeros_like(cuts[0]), *cuts, xp.ones_like(cuts[0])]
+        for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+            t = ((low + high) / 2)[:, None]
+            moves = (1 - t) * motions[i] + t * motions[i + 1]
+            pieces.append((start + t * way, (high - low)[:, None] * way, moves, (i, t)))
+    return pieces
+
+
+def _along(start: Array, end: Array, point: Array) -> tuple[Array, Array]:
+    """Where on straight pieces (S, 2) points lie, 0 to 1; and their squared distances from there."""
+    xp, way = namespace(start), end - start
+    square = xp.sum(way * way, axis=-1)
+    t = xp.sum((point - start) * way, axis=-1) / xp.where(square > 0, square, 1.0)
+    t = xp.clip(xp.where(square > 0, t, 0.0), 0.0, 1.0)
+    off = start + t[:, None] * way - point
+    return t, xp.sum(off * off, axis=-1)
+
+
+def _farthest(xp: Any, rows: Sequence[tuple[Array, ...]], sign: int) -> tuple[Array, ...]:
+    """Of rows whose first three arrays are keys, those with the largest keys, or with −1 the least, element by element."""
+    best = rows[0]
+    for row in rows[1:]:
+        beyond, same = False, True
+        for one, other in zip(row[:3], best[:3], strict=True):
+            one, other = (xp.astype(x, row[1].dtype) for x in (one, other))
+            beyond, same = beyond | (same & (sign * one > sign * other)), same & (one == other)
+        best = tuple(
+            xp.where(xp.reshape(beyond, (-1,) + (1,) * (x.ndim - 1)), x, y) for x, y in zip(row, best, strict=True)
+        )
+    return best
 
 
 def _next(k: int, ties: Array, side: Array, lone: Array, ends: Array) -> Array:

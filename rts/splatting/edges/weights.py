@@ -37,6 +37,7 @@ class _Weights(NamedTuple):
         moves: (B, 2, 3, 2).
         share: (S, 4, 2).
         cell_side: (S, 4, 2) int8.
+        lost: (S, 4, 2).
         flux: (S, 4, 2, 4, 2).
         cells: (B, 2, 3) int32.
         sides: (B, 2, 5).
@@ -49,6 +50,7 @@ class _Weights(NamedTuple):
     moves: np.ndarray
     share: np.ndarray
     cell_side: np.ndarray
+    lost: np.ndarray
     flux: np.ndarray
     cells: np.ndarray
     sides: np.ndarray
@@ -63,18 +65,18 @@ class _Weights(NamedTuple):
         points, origins = np.empty((count, 2, 2)), np.empty((count, 2, 2))
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
-        cell_side = np.empty((segments, 4, 2), np.int8)
+        cell_side, lost = np.empty((segments, 4, 2), np.int8), np.empty((segments, 4, 2))
         of_samples = outlines.rows, outlines.inner, outlines.pair, outlines.points
         loops.weigh_breaks(gap, near, outlines.slope, *of_samples, shown, points, movers, origins, moves)
         ties = outlines.ties
         geometry = ties, outlines.square_sides, outlines.corner, outlines.pull
-        known = outlines.square, *geometry, path, share, cell_side, flux
+        known = outlines.square, *geometry, path, share, cell_side, lost, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
         parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=250 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
-        return cls(shown, points, movers, origins, moves, share, cell_side, flux, cells, sides)
+        return cls(shown, points, movers, origins, moves, share, cell_side, lost, flux, cells, sides)
 
 
 def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
@@ -256,7 +258,7 @@ def _effective(outlines: Outlines) -> Outlines:
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:
     """The first operands of `edges_loops.add_segments`."""
     ties = outlines.square, outlines.ties, outlines.beyond
-    return *ties, weights.share, weights.cell_side, weights.flux, row, weights.shown
+    return *ties, weights.share, weights.cell_side, weights.lost, weights.flux, row, weights.shown
 
 
 def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:

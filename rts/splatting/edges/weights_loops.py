@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.contracts.records import ON_NEXT, ON_PREVIOUS
 
 # ------------------------------------------------------------------------------------------------------- weights
 
@@ -138,10 +139,135 @@ def _add_piece(flux, area, s, pull, i, lone, piece, share_of, first, second):
             _add_flux(flux, s, k, pull, i, lone, t, of_cell * first, of_cell * second, dx, dy)
 
 
+@compiled
+def _hidden(s, square_sides, ties):
+    """The lone break's segment that ends at segment s, see `rts.outlines.segments_loops.meet`; or −1."""
+    found = -1
+    if s + 1 < len(ties) and ties[s + 1, 1] < 0 and square_sides[s + 1, 1] == ON_PREVIOUS:
+        found = s + 1
+    if s > 0 and ties[s - 1, 1] < 0 and square_sides[s - 1, 1] == ON_NEXT:
+        found = s - 1
+    return found
+
+
+@compiled
+def _weigh_ray(flux, weight, s, i, side, border, ray, rates):
+    """Fill in what a break's outline, from its side of a square to a point where three meet, adds to the cells.
+
+    Args:
+        flux: see `weigh_segments`; filled in for segment s and jump i.
+        weight: (4,) to fill: by how much the colours of the cells' quarters rise with the jump, clockwise.
+        s: the segment.
+        i: the jump.
+        side: the side.
+        border: see `weigh_segments`.
+        ray: (3, 2), the break, a point between, and where the outlines meet.
+        rates: (3, 4), weights of the motions, of the four breaks that pull, at these points.
+    """
+    cuts, sign = np.empty(4), 1.0 if side < 2 else -1.0
+    start = _place(ray[0, 0], ray[0, 1], side)
+    for k in range(4):
+        low = 2.5 if k == 0 or k == 3 else 2.0
+        weight[k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
+    for n in range(2):
+        x, y = ray[n, 0], ray[n, 1]
+        wx, wy = ray[n + 1, 0] - x, ray[n + 1, 1] - y
+        a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+        b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+        cuts[0], cuts[1], cuts[2], cuts[3] = 0.0, min(a, b), max(a, b), 1.0
+        for m in range(3):
+            t, part = (cuts[m] + cuts[m + 1]) / 2, cuts[m + 1] - cuts[m]
+            px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
+            right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
+            below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+            for k in range(4):
+                east, south = k == 1 or k == 2, k >= 2
+                height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
+                weight[k] += height * dx
+                of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
+                for r in range(4):
+                    rate = (1 - t) * rates[n, r] + t * rates[n + 1, r]
+                    flux[s, k, i, r, 0] += of_cell * rate * dy
+                    flux[s, k, i, r, 1] -= of_cell * rate * dx
+
+
+@compiled
+def _along(a, b, point):
+    """Where on a straight piece a point lies, 0 to 1, and its squared distance from there."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    square = dx * dx + dy * dy
+    t = ((point[0] - a[0]) * dx + (point[1] - a[1]) * dy) / square if square > 0 else 0.0
+    t = min(max(t, 0.0), 1.0)
+    return t, (a[0] + t * dx - point[0]) ** 2 + (a[1] + t * dy - point[1]) ** 2
+
+
+@compiled
+def _fill_rays(s, h, ties, place, gap, square, corner, pull, rays, rates):
+    """Fill rays (3, 3, 2) and rates (3, 3, 4) of `_weigh_ray`: of a segment's start and end, and of the lone break."""
+    for e in range(3):
+        b = ties[s, e] if e < 2 else ties[h, 0]
+        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+        rays[e, 0, 0], rays[e, 0, 1] = _point(place[b], x, y, gap[b, 2])
+        rays[e, 2] = corner[h]
+        rates[e] = 0.0
+        rates[e, 0, 1 if e != 1 else 2] = 1.0
+    first, near = _along(rays[0, 0], corner[s], corner[h])
+    second, far = _along(rays[1, 0], corner[s], corner[h])
+    t, own = (first, 0) if near <= far else (second, 1)
+    for e in range(2):
+        rays[e, 1], rates[e, 1] = corner[s], pull[s]
+        for r in range(4):
+            rates[e, 2, r] = (1 - t) * rates[own, 0, r] + t * pull[s, r]
+    # The outlines meet on the piece between one end and the corner.
+    rays[own, 1] = (rays[own, 0] + rays[own, 2]) / 2
+    rates[own, 1] = (rates[own, 0] + rates[own, 2]) / 2
+    rays[2, 1] = (rays[2, 0] + rays[2, 2]) / 2
+    rates[2, 1], rates[2, 2] = rates[2, 0], rates[2, 0]
+
+
+@compiled
+def _weigh_meeting(
+    s, h, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, share, cell_side, lost, flux
+):
+    """Fill in the weights of a segment s and of the lone break h that ends at it; see `weigh_segments`.
+
+    Each of three outlines goes from its break to where they meet; between them lie three surfaces.
+    """
+    rays, rates, weights, at = np.empty((3, 3, 2)), np.empty((3, 3, 4)), np.empty((3, 4)), np.empty(3)
+    owners, jumps = (s, s, h), (0, 1, 0)
+    sides = square_sides[s, 0], square_sides[s, 1], square_sides[h, 0]
+    breaks = ties[s, 0], ties[s, 1], ties[h, 0]
+    _fill_rays(s, h, ties, place, gap, square, corner, pull, rays, rates)
+    for g in (s, h):
+        flux[g], share[g], lost[g], cell_side[g] = 0.0, 0.0, 0.0, -1
+    for e in range(3):
+        _weigh_ray(flux, weights[e], owners[e], jumps[e], sides[e], border, rays[e], rates[e])
+        at[e] = _place(rays[e, 0, 0], rays[e, 0, 1], sides[e])
+        for k in range(4):
+            share[owners[e], k, jumps[e]] = -weights[e, k] if sides[e] < 2 else weights[e, k]
+    for k in range(4):
+        # Clockwise, the breaks before and after the corner, between which its surface lies.
+        before, after = -1, -1
+        for e in range(3):
+            if before < 0 or (sides[e] < k, at[e], sides[e]) > (sides[before] < k, at[before], sides[before]):
+                before = e
+            if after < 0 or (sides[e] < k, at[e], sides[e]) < (sides[after] < k, at[after], sides[after]):
+                after = e
+        one, other = int(sides[before] < 2), int(sides[after] >= 2)
+        b, c = breaks[before], breaks[after]
+        next_b = _next_side(sides[before], k, near_ends[b, 0], near_ends[b, 1])
+        next_c = _next_side(sides[after], k, near_ends[c, 0], near_ends[c, 1])
+        known = (next_b == one or next_c == other) and next_b != 1 - one and next_c != 1 - other
+        if known and seen[b, one] and seen[c, other]:
+            cell_side[owners[before], k, jumps[before]], cell_side[owners[after], k, jumps[after]] = one, other
+            own = max(weights[after, k] - weights[before, k], 0.0) / 2
+            lost[owners[before], k, jumps[before]] = lost[owners[after], k, jumps[after]] = own
+
+
 @loop
 def weigh_segments(
     first, last, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, path, share, cell_side,
-    flux,
+    lost, flux,
 ):  # fmt: skip
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
@@ -162,16 +288,20 @@ def weigh_segments(
         share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps at start and end.
         cell_side: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that its
             centre shows; −1 if another may lie between.
+        lost: (S, 4, 2) to fill: for each cell and break, what is taken away of that surface.
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
             that pull.
     """
     cuts, area = np.empty(4), np.empty(4)
-    flux[first:last] = 0.0
     for s in range(first, last):
         if ties[s, 0] == ties[s, 1]:
-            path[s], share[s], cell_side[s] = 0.0, 0.0, -1
+            path[s], share[s], cell_side[s], lost[s], flux[s] = 0.0, 0.0, -1, 0.0, 0.0
             continue
-        lone = ties[s, 1] < 0
+        lone, hidden = ties[s, 1] < 0, _hidden(s, square_sides, ties)
+        if lone and square_sides[s, 1] >= 0:
+            path[s] = 0.0
+            continue  # Its weights are filled in with those of the segment that it ends at.
+        flux[s] = 0.0
         side0 = square_sides[s, 0]
         side1 = (side0 + 2) % 4 if lone else square_sides[s, 1]
         b = ties[s, 0]
@@ -187,6 +317,11 @@ def weigh_segments(
             path[s, 2, 0], path[s, 2, 1] = _point(place[b], start_x, start_y, gap[b, 2])
         for a in range(2):
             path[s, 1, a] = (path[s, 0, a] + path[s, 2, a]) / 2 if lone else corner[s, a]
+        if hidden >= 0:
+            of_breaks = place, gap, near_ends, seen
+            of_segments = square, ties, square_sides, corner, pull, share, cell_side, lost, flux
+            _weigh_meeting(s, hidden, border, *of_breaks, *of_segments)
+            continue
         # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
         sign0 = 1.0 if side0 < 2 else -1.0
         sign1 = sign0 if lone else (1.0 if side1 >= 2 else -1.0)
@@ -223,6 +358,7 @@ def weigh_segments(
             counts = not lone or side0 == k or side0 == (k + 3) % 4
             beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
             share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
+            lost[s, k, 0] = lost[s, k, 1] = abs(beside)
             first, second = int((sign0 > 0) != on_right), int((sign1 > 0) != on_right)
             at_start = _next_side(side0, k, near_ends[ties[s, 0], 0], near_ends[ties[s, 0], 1])
             at_end = -1 if lone else _next_side(side1, k, near_ends[ties[s, 1], 0], near_ends[ties[s, 1], 1])
@@ -459,7 +595,9 @@ def _pull_rates(s, k, ties, beyond, flux, first, second, g_motion):
 
 
 @loop
-def add_segments(border, square, ties, beyond, share, cell_side, flux, row, shown, rgba, jump, steady, motion, out):
+def add_segments(
+    border, square, ties, beyond, share, cell_side, lost, flux, row, shown, rgba, jump, steady, motion, out
+):
     """Add to an image (h, w, C) the changes that segments make.
 
     Args:
@@ -469,6 +607,7 @@ def add_segments(border, square, ties, beyond, share, cell_side, flux, row, show
         beyond: (S, 2).
         share: (S, 4, 2), see `weigh_segments`.
         cell_side: (S, 4, 2).
+        lost: (S, 4, 2).
         flux: (S, 4, 2, 4, 2).
         row: (H, W) int32.
         shown: (B, 2), the samples that tell colours.
@@ -486,24 +625,24 @@ def add_segments(border, square, ties, beyond, share, cell_side, flux, row, show
             i, j = y - border, x - border
             if not _is_in(out, i, j):
                 continue
-            known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
+            sides, first, second = cell_side[s, k], 0.0, 0.0
             if len(motion):
                 first, second = _rates(s, k, ties, beyond, flux, motion)
             for c in range(out.shape[2]):
                 value = first * steady[start, c] + second * steady[end, c]
                 if len(jump):
                     value += share[s, k, 0] * jump[start, c] + share[s, k, 1] * jump[end, c]
-                if len(jump) and known:
-                    # What is taken away of the cell's own surface has the colour at its centre.
-                    here = _of(rgba, row[y, x], c)
-                    value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, cell_side[s, k, 0]], c))
-                    value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, cell_side[s, k, 1]], c))
+                # What is taken away of the cell's own surface has the colour at its centre.
+                if len(jump) and sides[0] >= 0:
+                    value -= lost[s, k, 0] * (_of(rgba, row[y, x], c) - _of(rgba, shown[start, sides[0]], c))
+                if len(jump) and sides[1] >= 0:
+                    value -= lost[s, k, 1] * (_of(rgba, row[y, x], c) - _of(rgba, shown[end, sides[1]], c))
                 out[i, j, c] += value
 
 
 @loop
 def pull_segments(
-    border, square, ties, beyond, share, cell_side, flux, row, shown, steady, g, g_rgba, g_jump, g_motion
+    border, square, ties, beyond, share, cell_side, lost, flux, row, shown, steady, g, g_rgba, g_jump, g_motion
 ):  # fmt: skip
     """Add to gradients of colours, jumps (B, C) and motions (B, 2) those of `add_segments`; empty ones: not wanted."""
     for s in range(len(square)):
@@ -514,18 +653,19 @@ def pull_segments(
             i, j = y - border, x - border
             if not _is_in(g, i, j):
                 continue
-            known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
+            sides, first, second = cell_side[s, k], 0.0, 0.0
             for c in range(g.shape[2]):
                 first += g[i, j, c] * steady[start, c]
                 second += g[i, j, c] * steady[end, c]
                 if len(g_jump):
                     g_jump[start, c] += share[s, k, 0] * g[i, j, c]
                     g_jump[end, c] += share[s, k, 1] * g[i, j, c]
-                if len(g_rgba) and known:
-                    one, other = abs(share[s, k, 0]) * g[i, j, c], abs(share[s, k, 1]) * g[i, j, c]
-                    _add_to(g_rgba, shown[start, cell_side[s, k, 0]], c, one)
-                    _add_to(g_rgba, shown[end, cell_side[s, k, 1]], c, other)
-                    _add_to(g_rgba, row[y, x], c, -one - other)
+                if len(g_rgba) and sides[0] >= 0:
+                    _add_to(g_rgba, shown[start, sides[0]], c, lost[s, k, 0] * g[i, j, c])
+                    _add_to(g_rgba, row[y, x], c, -lost[s, k, 0] * g[i, j, c])
+                if len(g_rgba) and sides[1] >= 0:
+                    _add_to(g_rgba, shown[end, sides[1]], c, lost[s, k, 1] * g[i, j, c])
+                    _add_to(g_rgba, row[y, x], c, -lost[s, k, 1] * g[i, j, c])
             if len(g_motion) and (first != 0 or second != 0):
                 _pull_rates(s, k, ties, beyond, flux, first, second, g_motion)
 
