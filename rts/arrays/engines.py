@@ -278,18 +278,13 @@ def stopped(tree: Tree) -> Tree:
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
-    """The tree with every NumPy array and number made a constant of the engine; see `Engine.constant`.
-
-    Whole numbers of Python are numbers like others, of a floating dtype.
-    """
+    """The tree with every NumPy array and number made a constant of the engine; see `Engine.constant`."""
     if tree is None or type(tree) in OWNERS:
         return tree
     if type(tree) is np.ndarray:
         return engine.constant(tree, like)
 
     def constant(x: Any) -> Array:
-        if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES):
-            return x
-        return engine.constant(float(x) if type(x) is int else x, like)
+        return x if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES) else engine.constant(x, like)
 
     return map_leaves(constant, tree)

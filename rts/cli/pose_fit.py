@@ -76,13 +76,14 @@ def available_engine() -> str:
 def silhouette_of(image: np.ndarray) -> np.ndarray:
     """The silhouette (H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or, if it is opaque, its brightness.
 
-    Brightness is the mean of the colours as files have them: 128 of 255 in a mask means that half of a pixel is inside.
+    Brightness is of colours as files have them: 128 of 255 in a mask means that half of a pixel is inside.
 
     Raises:
         InputError: no pixel, or every pixel, is inside; above 0.5 is inside.
     """
     alpha = image[..., 3]
-    mask = alpha if (alpha < 1).any() else encode_srgb(image[..., :3]).mean(axis=2)
+    luma = np.array([0.2126, 0.7152, 0.0722], np.float32)
+    mask = alpha if (alpha < 1).any() else encode_srgb(image[..., :3]) @ luma
     if not mask.max() > 0.5 or not mask.min() < 0.5:
         raise InputError(
             f"the target's silhouette lies between {mask.min():.2g} and {mask.max():.2g}; expected a picture "

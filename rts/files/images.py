@@ -73,6 +73,10 @@ def png_of(image: Array) -> bytes:
     return file.getvalue()
 
 
+PHOTOGRAPHS = {"JPEG", "MPO", "WEBP"}
+"""Formats of photographs, whose EXIF data are read in no time."""
+
+
 def load_image(path: Any) -> np.ndarray:
     """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads, of .hdr or .exr.
 
@@ -84,7 +88,8 @@ def load_image(path: Any) -> np.ndarray:
         PluginError: .exr without OpenEXR (extra `exr`).
 
     Warns:
-        FileWarning: Pillow found something wrong with it; it is a photograph that is stored on its side, which stays.
+        FileWarning: Pillow found something wrong with it; it is a JPEG or WebP that is stored on its side, as which it
+            is read.
     """
     path = as_path(path)
     if path.is_dir():
@@ -106,9 +111,12 @@ def _warn_of_turns(path: Path) -> None:
     """Warn of a picture that viewers turn upright, or mirror, by its EXIF data."""
     from PIL import ExifTags, Image
 
-    with Image.open(path) as image:
-        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    if orientation != 1:
+    orientation = None
+    # Pillow itself turns TIFF. Damaged EXIF data raise many kinds of errors, and say nothing.
+    with Image.open(path) as image, contextlib.suppress(Exception):
+        if image.format in PHOTOGRAPHS:
+            orientation = image.getexif().get(ExifTags.Base.Orientation)
+    if orientation in range(2, 9):
         warn(
             f"{path} is stored on its side or mirrored (EXIF orientation {orientation}), and is read as stored; "
             f"PIL.ImageOps.exif_transpose turns it, for which a camera found from stored pixels is wrong"

@@ -287,6 +287,12 @@ def read_obj(path: Path) -> list[Piece]:
     return pieces
 
 
+def _several(folder: Path, names: str) -> list[Path]:
+    """The files of a folder that names between spaces are of; none unless all are."""
+    files = [folder / name for name in names.split() if Path(name).name == name]
+    return files if len(files) == len(names.split()) and all(file.is_file() for file in files) else []
+
+
 def _warn_of_gaps(path: Path, table: np.ndarray, sizes: np.ndarray, of_face: np.ndarray) -> None:
     """Warn of faces without texture coordinates or normals, of materials some of whose faces have them."""
     lacks = np.logical_or.reduceat(table[:, 1:] < 0, np.cumsum(sizes) - sizes)
@@ -305,11 +311,10 @@ def _materials(lines: _Lines) -> dict[str | None, MtlMaterial]:
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
         # A line may name several files, and a name may hold spaces.
-        several = [library] if library.is_file() else [inside(lines.path.parent, x, lines.path) for x in name.split()]
-        if several and all(file.is_file() for file in several):
-            for file in several:
-                materials.update(read_mtl(file, lines.path.parent))
-        else:
+        several = [library] if library.is_file() else _several(lines.path.parent, name)
+        for file in several:
+            materials.update(read_mtl(file, lines.path.parent))
+        if not several:
             warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
                 "loaded without materials"

@@ -17,18 +17,23 @@ from rts.errors import InputError
 def entry_of(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Array:
     """An entry of θ, refused where it has none of these shapes."""
     value = theta[name]
-    check_entry(f"[{name!r}]", value, " or ".join(map(str, shapes)), shape_of(value) in shapes)
-    return value
+    return check_entry(f"[{name!r}]", value, " or ".join(map(str, shapes)), shape_of(value) in shapes)
 
 
-def check_entry(entry: str, value: Any, expected: str, ok: bool) -> None:
-    """Refuse an entry of θ that is no finite number or floating array; `ok` says that it has the expected shape."""
+def check_entry(entry: str, value: Any, expected: str, ok: bool) -> Any:
+    """An entry of θ, refused if it is no finite number or floating array; `ok` says that it has the expected shape.
+
+    A whole number becomes a floating one.
+    """
     number = isinstance(value, (bool, int, float))
     if not ok or not (number or hasattr(value, "dtype")):
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
+    if not number and value.shape == () and namespace(value).isdtype(value.dtype, "integral"):
+        value = namespace(value).astype(value, namespace(value).float32)
     if not number and not namespace(value).isdtype(value.dtype, "real floating"):
         raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
     check_bounded(f"theta{entry}", np.asarray(value, float) if number else value)
+    return value
 
 
 def check_base(name: str, base: Array) -> None:

@@ -578,3 +578,18 @@ def test_what_plugins_give_in_wrong_shapes_is_refused_by_name():
     for call, words in cases:
         with pytest.raises(rts.InputError, match=words):
             call()
+
+
+def test_whole_numbers_of_theta_are_counts_and_indices_for_a_shader():
+    torch = pytest.importorskip("torch")
+
+    def shader(theta, gbuffer, camera):
+        total = 0 * gbuffer["position"][:, :1]
+        for _ in range(theta["terms"]):
+            total = total + theta["table"][theta["row"]]
+        return torch.cat([total, total, total, 0 * total + 1], dim=1)
+
+    vertices, faces = icosphere(0)
+    theta = {"vertices": torch.tensor(vertices), "terms": 3, "row": 1, "table": np.array([9.0, 0.25], np.float32)}
+    image = rts.render(rts.Part(MESH(faces), theta, shader), CAMERA, SIZE)
+    assert float(image[..., 0].max()) == pytest.approx(0.75)

@@ -113,7 +113,7 @@ def test_whole_numbers_of_python_are_numbers_of_materials_and_lights(kind):
         theta = entries | {"metallic": one, "roughness": one, "light": {"direction": (0, two, 0), "ambient": two}}
         return to_numpy(rts.render(part.replace(theta=theta, shader="pbr"), camera, (9, 12)))
 
-    np.testing.assert_array_equal(image(1, 2), image(1.0, 2.0))
+    np.testing.assert_allclose(image(1, 2), image(1.0, 2.0), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("metallic, roughness", [g for g in GRID if g[1] >= 0.2])
