@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from rts.advice.empty_images import why_empty
+from rts.advice.moved_vertices import warn_of_moved_vertices
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
@@ -96,10 +97,12 @@ def render(
         AspectWarning: the camera is for images of another ratio of width to height.
         InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`; nothing reads an entry of θ; a
             culled part is wound inside out; a sampler cannot sample single points, so that outlines lie midway between
-            centres.
+            centres; vertices of prepared parts have changed.
         LayersWarning: surfaces or light behind the last layer are left out.
     """
     scene, wanted = Scene.of(parts, camera, sampler, engine), None if outputs is None else Outputs(outputs)
+    if isinstance(parts, Prepared):
+        warn_of_moved_vertices(scene.parts, scene.entries)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
     background = check_background(background, size, scene.channels)
     scene = scene.at(size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rts.advice.moved_vertices import warn_of_moved_vertices
 from rts.arrays.engines import context_of_scene, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checked_parts import changed_part, check_changes, check_channels
@@ -61,8 +62,8 @@ def prepare(
         size: (height, width); needed for the same surfaces.
 
     Returns:
-        The parts with their structures. Later changes to vertices have no effect; `replace` changes transforms, shaders
-        and the rest of θ.
+        The parts with their structures. `replace` changes transforms, shaders, colours and the like. Vertices must
+        stay: samples do not follow them, and a render warns where they have changed.
 
     Raises:
         InputError: an argument is wrong or traced, or a surface's triangles depend on a view that is not given.
@@ -105,6 +106,9 @@ class Renderer:
 
         Raises:
             InputError: there is no such part or field, or its value is wrong.
+
+        Warns:
+            InputWarning: vertices have changed since `prepare`.
         """
         scene = self._scene
         check_changes(index, changes, len(scene.parts))
@@ -115,4 +119,5 @@ class Renderer:
                 check_background(self._background, self._size, check_channels(parts))
             context = context_of_scene(parts, scene.camera, engine=self._engine)
             scene = scene._replace(parts=parts, context=context)
+        warn_of_moved_vertices(scene.parts, scene.entries)
         return image_over(scene, self._size, self._background, self._settings)

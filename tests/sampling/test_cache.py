@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import warnings
 import weakref
 
 import numpy as np
@@ -672,3 +673,22 @@ def test_a_renderer_refuses_what_render_refuses():
     ):
         with pytest.raises(InputError, match=words):
             draw(**changes)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch"])
+def test_a_render_of_a_handle_warns_of_vertices_that_have_changed(kind):
+    torch = pytest.importorskip("torch")
+    vertices, faces = icosphere(2)
+    part = part_of(vertices, faces, shader="silhouette")
+    if kind == "torch":
+        part = part.replace(theta=part.theta | {"vertices": torch.tensor(vertices)})
+    handle = rts.prepare(part, "raster")
+    draw = handle.renderer(CAMERA, SIZE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw(transform=rts.rigid(np.full(6, 0.01)))
+        rts.render(handle, CAMERA, SIZE)
+    part.theta["vertices"][:] *= 0.9
+    for call in (draw, lambda: rts.render(handle, CAMERA, SIZE)):
+        with pytest.warns(rts.errors.InputWarning, match="vertices of part 0 have changed since rts.prepare"):
+            call()
