@@ -19,7 +19,7 @@ size, count, points = ((24, 24), 15, 12) if quick else ((64, 64), 200, 24)
 # ## Ball and ring, as values
 #
 # Each lattice point holds its distance to the surface: below zero inside, above zero outside. `rts.Isosurface` draws
-# the zero level of such values. It needs the extra `isosurface`.
+# the zero level of such values.
 
 # %%
 axes = np.linspace(-1.2, 1.2, points, dtype=np.float32)

@@ -35,8 +35,9 @@ def save_image(path: Any, image: Array, exposure: float | None = None) -> None:
     Args:
         path: a name with one of these extensions; folders that do not exist are made.
         image: (H, W, 4) premultiplied linear RGBA, (H, W, 3), (H, W, 1) or (H, W), floating numbers, an array of any
-            engine or nested lists. In a .png, values outside [0, 1] are clipped. A .hdr has no alpha, and nothing
-            below 0.
+            engine or nested lists. In a .png, values outside [0, 1] are clipped, and colours are sRGB; of (H, W),
+            which is light, too. A mask of coverage, such as `image[..., 3]`, would be encoded as well: save the
+            RGBA image, whose alpha is not. A .hdr has no alpha, and nothing below 0.
         exposure: for colours in a .png: stops by which they are made brighter, before `rts.shading.tonemap` brings
             them into the range of a display. None does neither.
 

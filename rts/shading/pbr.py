@@ -116,6 +116,10 @@ class Pbr(Unlit):
         if name not in theta:
             return None
         shape = shape_of(theta[name])
+        if len(shape) == 2 and name != "normal_map":
+            raise InputError(
+                f"theta[{name!r}] {described(theta[name])}; expected a number, or a map (h, w, {channels})"
+            )
         if len(shape) != 3 and name != "normal_map":
             numbers = ((3,),) if name == "emissive" else ((), (1,)) if channels == 1 else ((), (1,), (3,))
             return entry_of(theta, name, *numbers)

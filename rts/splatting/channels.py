@@ -67,7 +67,7 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
         # In tens, so that a loop does not repeat the warning in other words.
         warn(
             f"up to {10 * math.ceil(10 * light)} % of the light passes through the last of {len(row)} layers, and "
-            f"surfaces farther back, if any, are left out; give a larger number of layers, or layers='auto'",
+            f"surfaces farther back, if any, are left out; give a larger number of layers ('auto' takes up to 16)",
             LayersWarning,
         )
 

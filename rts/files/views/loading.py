@@ -83,7 +83,8 @@ def load_views(
             COLMAP model aside: the others come before it.
         split: which transforms_….json of a folder: "train", "val" or "test". COLMAP tells none: "test" is every eighth
             picture in the order of names, the first one among them, as in mip-NeRF 360; "train" all others, "all" all.
-            LLFF and OpenCV have all. None is "train", and a warning says how many of COLMAP's are left out.
+            LLFF and OpenCV have all. A folder with one transforms.json has no others: leave `split` out. None is
+            "train", and a warning says how many of COLMAP's are left out.
         downscale: n, for images of 1/n of the size: means of n × n premultiplied pixels, encoded as `linear` says. In
             LLFF and COLMAP the folder `images_n` is used instead, if it exists, and its masks `masks_n`, or `masks`.
         linear: True if images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
@@ -157,7 +158,14 @@ def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: A
     if not (split is None or isinstance(split, str)):
         raise InputError(f"split is {quoted(split)}; expected a name such as 'train'")
     if path.is_dir():
-        return _cameras_of_folder(path, split or "train")
+        found = _cameras_of_folder(path, split or "train")
+        if found.name == "transforms.json" and split not in (None, "all"):
+            raise InputError(
+                f"the folder {path} has no transforms_{split}.json; leave split out for all views of transforms.json"
+            )
+        if found.name == "cameras.json" and split not in (None, "train", "val", "test", "all"):
+            raise InputError(f"split is {quoted(split)}; expected 'train', 'val', 'test' or 'all'")
+        return found
     if not path.is_file():
         raise InputError(f"there is no file {path}; check the path (relative paths start at {Path.cwd()})")
     if path.suffix.lower() not in (".json", ".npy") and path.name not in CAMERAS:
