@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 from rts.advice.empty_images import why_empty
-from rts.advice.moved_vertices import warn_of_moved_vertices
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
@@ -21,7 +20,7 @@ from rts.rendering.outputs import Outputs, fronts_of
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
-from rts.sampling.prepared import Prepared
+from rts.sampling.prepared import Prepared, warn_of_moved_vertices
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part

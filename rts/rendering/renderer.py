@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rts.advice.moved_vertices import warn_of_moved_vertices
 from rts.arrays.engines import context_of_scene, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checked_parts import changed_part, check_changes, check_channels
@@ -13,7 +12,7 @@ from rts.contracts.checks import check_background
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_over
 from rts.rendering.settings import RenderSettings
-from rts.sampling.prepared import Prepared
+from rts.sampling.prepared import Prepared, warn_of_moved_vertices
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part

@@ -543,7 +543,7 @@ def _along(start: Array, end: Array, point: Array) -> tuple[Array, Array]:
 
 
 def _farthest(xp: Any, rows: Sequence[tuple[Array, ...]], sign: int) -> tuple[Array, ...]:
-    """Of rows whose first three arrays are keys, those with the largest (or with −1 least) keys, element by element."""
+    """The rows with the largest keys, their first three arrays, or with −1 the least; element by element."""
     best = rows[0]
     for row in rows[1:]:
         beyond, same = False, True
