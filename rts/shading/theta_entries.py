@@ -28,12 +28,17 @@ def check_entry(entry: str, value: Any, expected: str, ok: bool) -> Any:
     number = isinstance(value, (bool, int, float))
     if not ok or not (number or hasattr(value, "dtype")):
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
-    if not number and value.shape == () and namespace(value).isdtype(value.dtype, "integral"):
-        value = namespace(value).astype(value, namespace(value).float32)
-    if not number and not namespace(value).isdtype(value.dtype, "real floating"):
-        raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
-    check_bounded(f"theta{entry}", np.asarray(value, float) if number else value)
-    return value
+    if number:
+        check_bounded(f"theta{entry}", np.asarray(value, float))
+        return value
+    array: Any = value
+    xp = namespace(array)
+    if array.shape == () and xp.isdtype(array.dtype, "integral"):
+        array = xp.astype(array, xp.float32)
+    if not xp.isdtype(array.dtype, "real floating"):
+        raise InputError(f"theta{entry} has dtype {array.dtype}; expected floating numbers")
+    check_bounded(f"theta{entry}", array)
+    return array
 
 
 def check_base(name: str, base: Array) -> None:

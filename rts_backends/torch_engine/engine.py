@@ -233,7 +233,8 @@ class TorchEngine(Engine):
                 variables.append(x.detach().requires_grad_(True))
                 return variables[-1]
 
-            value = f(map_leaves(variable, tree))
+            with torch.enable_grad():  # Whatever surrounds the call.
+                value = f(map_leaves(variable, tree))
             if value.requires_grad:
                 gradients = torch.autograd.grad(value, variables, materialize_grads=True)
             else:

@@ -24,7 +24,7 @@ def to_tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
 
 def to_host(x: torch.Tensor) -> np.ndarray:
     """The detached value as NumPy, without a copy where it is on the host; both half precisions as float32."""
-    x = x.detach().cpu()
+    x = x.detach().cpu().resolve_neg()
     return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
 
 

@@ -11,6 +11,9 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.contracts.records import ON_NEXT, ON_PREVIOUS
 
+ROUNDING = 1e-6
+"""The size of numbers that rounding leaves of sums of shares."""
+
 # ------------------------------------------------------------------------------------------------------- weights
 
 
@@ -638,6 +641,20 @@ def add_segments(
                 if len(jump) and sides[1] >= 0:
                     value -= lost[s, k, 1] * (_of(rgba, row[y, x], c) - _of(rgba, shown[end, sides[1]], c))
                 out[i, j, c] += value
+
+
+@loop
+def settle(border, square, out):
+    """Make numbers of cells beside segments 0 or 1 that differ from these by rounding: below 0, and alpha above 1."""
+    for s in range(len(square)):
+        for k in range(4):
+            i, j = square[s, 0] + (k >= 2) - border, square[s, 1] + (k == 1 or k == 2) - border
+            if not _is_in(out, i, j):
+                continue
+            for c in range(out.shape[2]):
+                out[i, j, c] = 0.0 if -ROUNDING < out[i, j, c] < 0 else out[i, j, c]
+            alpha = out[i, j, out.shape[2] - 1]
+            out[i, j, out.shape[2] - 1] = 1.0 if 1 < alpha < 1 + ROUNDING else alpha
 
 
 @loop

@@ -1,0 +1,76 @@
+"""Points where three outlines meet: an edge that ends behind another surface. Closed forms of polygons."""
+
+import numpy as np
+import pytest
+from cards import SIZE, SQUARE, card, covered, flat, in_pixels, turned
+from helpers import pushed
+
+import rts
+
+torch = pytest.importorskip("torch")
+
+pytestmark = pytest.mark.splatting
+
+NEAR, FAR = turned(SQUARE, 0.2, (10.2, 12)), turned(SQUARE * 1.2, -0.3, (14, 11.6))
+RED, GREEN = (1.0, 0, 0), (0, 1.0, 0)
+
+
+def common(one, other):
+    """The polygon that two convex ones have in common; corners (C, 2), clockwise in the image."""
+    for a, b in zip(other, np.roll(other, -1, axis=0), strict=True):
+        way, kept = b - a, []
+        sides = way[0] * (one - a)[:, 1] - way[1] * (one - a)[:, 0]
+        for p, q, sp, sq in zip(one, np.roll(one, -1, axis=0), sides, np.roll(sides, -1), strict=True):
+            if sp >= 0:
+                kept.append(p)
+            if sp * sq < 0:
+                kept.append(p + (q - p) * sp / (sp - sq))
+        one = np.array(kept).reshape(-1, 2)
+    return one
+
+
+def pair(near, far, move=None):
+    """An image of a card before another one, moved if `move` is given."""
+    vertices = flat(near, 3.0)
+    return rts.render(
+        [card(vertices if move is None else move(vertices), RED), card(flat(far, 4.0), GREEN)], in_pixels(), SIZE
+    )
+
+
+def expected(near, far):
+    """What is seen of both cards (H, W, 2)."""
+    hidden = common(far, near)
+    return np.stack([covered(near, SIZE), covered(far, SIZE) - covered(hidden, SIZE)], axis=-1)
+
+
+PLACES = [(0.0, 0.0), (0.3, 0.45), (0.71, 0.13), (0.5, 0.5)]
+
+
+@pytest.mark.parametrize("shift", PLACES)
+def test_a_card_before_another_has_the_colours_of_both_by_area(shift):
+    image = pair(NEAR + shift, FAR)
+    errors = np.abs(image[..., :2] - expected(NEAR + shift, FAR)).max(-1)
+    # Corners that lie in the square of another edge are left out.
+    assert np.sort(errors.ravel())[-4] < 1e-4 and errors.max() < 0.1
+    assert image[..., 3].max() < 1 + 1e-6 and image.min() >= 0
+
+
+@pytest.mark.parametrize("shift", PLACES[:3])
+def test_it_moves_as_polygons_do(shift):
+    way, step = np.array([0.6, -0.3]), 1e-5
+    velocity = torch.tensor([*way, 0.0], dtype=torch.float32)
+    near = NEAR + shift
+    _, derivative = pushed(lambda t: pair(near, FAR, lambda v: torch.as_tensor(v) + t * velocity))
+    truth = (expected(near + step * way, FAR) - expected(near - step * way, FAR)) / (2 * step)
+    error = np.linalg.norm(derivative[..., :2] - truth) / np.linalg.norm(truth)
+    assert error < 0.08
+
+
+@pytest.mark.parametrize("seam", [8.0, 8.3, 8.5, 8.83])
+def test_cards_side_by_side_leave_no_trace_of_their_seam(seam):
+    left, right = ([(3.0, 3), (seam, 3), (seam, 12.4), (3, 12.4)], [(seam, 3), (13.2, 3), (13.2, 12.4), (seam, 12.4)])
+    parts = [card(flat(np.array(corners)), color) for corners, color in ((left, RED), (right, GREEN))]
+    image = rts.render(parts, in_pixels(), SIZE)
+    shares = np.stack([covered(np.array(corners), SIZE) for corners in (left, right)], axis=-1)
+    np.testing.assert_allclose(image[..., :2], shares, atol=2e-3)
+    np.testing.assert_allclose(image[..., 3], shares.sum(-1), atol=2e-3)
