@@ -356,20 +356,26 @@ def _in_one_square(origin, s, t):
 
 @compiled
 def _towards(start, way, a, b):
-    """Where a line from a point along a direction meets the straight piece from a to b; its distance, or infinite."""
+    """The point of a straight piece from a to b that is seen nearest along a direction from a point.
+
+    Returns:
+        The point; how far it is off the line in this direction; and how far ahead along it.
+    """
     piece, off = _minus(b, a), _minus(a, start)
     turn = way[0] * piece[1] - way[1] * piece[0]
-    if turn == 0:
-        return a, np.inf
-    distance, t = (off[0] * piece[1] - off[1] * piece[0]) / turn, (off[0] * way[1] - off[1] * way[0]) / turn
-    return (a[0] + t * piece[0], a[1] + t * piece[1]), distance if distance >= 0 and 0 <= t <= 1 else np.inf
+    t = (off[0] * way[1] - off[1] * way[0]) / turn if turn != 0 else 0.5
+    t = min(max(t, 0.0), 1.0)
+    point = a[0] + t * piece[0], a[1] + t * piece[1]
+    dx, dy = _minus(point, start)
+    ahead = way[0] * dx + way[1] * dy
+    return point, abs(way[0] * dy - way[1] * dx) + max(-ahead, 0.0), ahead
 
 
 @loop
 def meet(origin, ties, square_sides, place, tangent, corner):
     """Let a break that is alone beside one segment in its square end there: fill in its second side, and its corner.
 
-    Its outline is hidden by what the segment bounds. It goes on along its tangent, or else to the segment's corner.
+    Its outline is hidden by what the segment bounds. It goes on along its tangent, as near as the segment allows.
     Arguments are as of `corners`.
     """
     for s in range(len(ties)):
@@ -381,10 +387,10 @@ def meet(origin, ties, square_sides, place, tangent, corner):
             continue
         left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
         start, middle = _row(place, ties[s, 0]), (corner[other, 0] + left, corner[other, 1] + top)
-        way, meeting, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), middle, np.inf
+        way, meeting, least, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), middle, np.inf, np.inf
         for e in range(2):
-            there, distance = _towards(start, way, _row(place, ties[other, e]), middle)
-            if distance < nearest:
-                meeting, nearest = there, distance
+            there, off, ahead = _towards(start, way, _row(place, ties[other, e]), middle)
+            if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
+                meeting, least, nearest = there, off, ahead
         square_sides[s, 1] = ON_PREVIOUS if other < s else ON_NEXT
         corner[s, 0], corner[s, 1] = min(max(meeting[0] - left, 0.0), 1.0), min(max(meeting[1] - top, 0.0), 1.0)

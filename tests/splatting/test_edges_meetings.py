@@ -50,8 +50,8 @@ PLACES = [(0.0, 0.0), (0.3, 0.45), (0.71, 0.13), (0.5, 0.5)]
 def test_a_card_before_another_has_the_colours_of_both_by_area(shift):
     image = pair(NEAR + shift, FAR)
     errors = np.abs(image[..., :2] - expected(NEAR + shift, FAR)).max(-1)
-    # Corners that lie in the square of another edge are left out.
-    assert np.sort(errors.ravel())[-4] < 1e-4 and errors.max() < 0.1
+    # Where a corner lies in the square of another edge, up to three pixels are off.
+    assert np.sort(errors.ravel())[-4] < 1e-4 and errors.max() < 0.2
     assert image[..., 3].max() < 1 + 1e-6 and image.min() >= 0
 
 

@@ -90,7 +90,7 @@ def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
     loops.motions(positions, weights.movers, weights.origins, weights.moves, motion)
     _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out, border)
-    loops.settle(border, outlines.square, out)
+    loops.settle(border, outlines.square, 8 * np.finfo(out.dtype).eps, out)
     return weights
 
 

@@ -11,9 +11,6 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.contracts.records import ON_NEXT, ON_PREVIOUS
 
-ROUNDING = 1e-6
-"""The size of numbers that rounding leaves of sums of shares."""
-
 # ------------------------------------------------------------------------------------------------------- weights
 
 
@@ -644,7 +641,7 @@ def add_segments(
 
 
 @loop
-def settle(border, square, out):
+def settle(border, square, rounding, out):
     """Make numbers of cells beside segments 0 or 1 that differ from these by rounding: below 0, and alpha above 1."""
     for s in range(len(square)):
         for k in range(4):
@@ -652,9 +649,9 @@ def settle(border, square, out):
             if not _is_in(out, i, j):
                 continue
             for c in range(out.shape[2]):
-                out[i, j, c] = 0.0 if -ROUNDING < out[i, j, c] < 0 else out[i, j, c]
+                out[i, j, c] = 0.0 if -rounding < out[i, j, c] < 0 else out[i, j, c]
             alpha = out[i, j, out.shape[2] - 1]
-            out[i, j, out.shape[2] - 1] = 1.0 if 1 < alpha < 1 + ROUNDING else alpha
+            out[i, j, out.shape[2] - 1] = 1.0 if 1 < alpha < 1 + rounding else alpha
 
 
 @loop
