@@ -69,9 +69,12 @@ class Terms:
         if not self.several:
             return [None]
         keys: Any = self.residuals.draw(step)
-        if not isinstance(keys, Iterable) or isinstance(keys, str):
-            raise InputError(f"draw of {self.residuals!r} gave {quoted(keys)}; expected a list of keys of terms")
-        keys = list(keys)
+        try:
+            keys = None if isinstance(keys, (str, bytes)) else list(keys)
+        except TypeError:
+            keys = None
+        if keys is None:
+            raise InputError(f"draw of {self.residuals!r} gave no list of keys of terms")
         if not keys:
             raise InputError(f"residuals drew no term at step {step}; expected at least one")
         return keys

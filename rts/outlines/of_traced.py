@@ -65,7 +65,9 @@ class _Call:
     def __init__(self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool):
         parts = [replace(part, theta={}, transform=None) for part in scene.parts]
         self._context = Context(engine_of(), np.zeros((), real_of(scene)))
-        self._scene, self._size = scene._replace(parts=parts, cameras=[], context=self._context), grid.size
+        camera = scene.camera.map(lambda _: np.eye(4))  # Not read: that of the cells is among the values.
+        self._scene = scene._replace(parts=parts, camera=camera, cameras=[], context=self._context)
+        self._size = grid.size
         self._layers, self._told = layers, told
         self._values = map_leaves(lambda x: x if type(x) is np.ndarray else 0.0, values)
         self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)

@@ -132,23 +132,28 @@ class HostCall:
         if not self._surface.centered:
             tables[ON_RAYS] = self._bounds.row_spec(np.float32, 3)._replace(by_sample=True)
 
+        # Programs keep the function, which must not keep what was traced.
+        views, moves, further_ones, entry = len(self._cameras), len(self._transform), len(arrays), self._entry
+        places, surface, theta = map_leaves(lambda _: 0.0, self._inputs), self._surface, self._theta
+        attributes_of, view = self._attributes, self._bounds.view
+
         def host(*operands: np.ndarray) -> tuple[Any, ...]:
             it = iter(operands)
-            seen = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in self._cameras]
-            moved = [next(it) for _ in self._transform]
+            seen = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in range(views)]
+            moved = [next(it) for _ in range(moves)]
             cameras = [check_camera(camera, *moved) for camera in seen]
-            further = [next(it) for _ in arrays]
-            inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
+            further = [next(it) for _ in range(further_ones)]
+            inputs = map_leaves(lambda _: next(it), places) if entry is None else entry.inputs
             found, more = find(cameras, inputs, *further)
-            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
+            gbuffer = {} if theta is None else surface.evaluate(theta, found)
             if ON_RAYS in tables:
-                on_rays = _on_rays(found, cameras[0], self._bounds.view, *further)
+                on_rays = _on_rays(found, cameras[0], view, *further)
                 found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
             return (
                 *(found.ids, found.params, found.row, found.depth, found.overflow),
                 *(more[name] for name in beside),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
-                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in self._attributes.items()),
+                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes_of.items()),
             )
 
         sample_specs = self._bounds.specs(self._surface.sample_widths)

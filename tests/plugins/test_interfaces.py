@@ -262,7 +262,7 @@ def test_terms_of_residuals_have_three_methods():
         rts.fit(Terms(), torch.zeros(2), steps=1)
     own = {"load": lambda self, key: {}, "of": lambda self, data: self}
     for name, change, expected in (
-        ("draw", lambda self, step: 3, "draw of .* gave 3; expected a list of keys"),
+        ("draw", lambda self, step: 3, "draw of .* gave no list of keys"),
         ("of", lambda self, data: None, "of of .* gave None; expected residuals of one term"),
     ):
         with pytest.raises(rts.InputError, match=expected):

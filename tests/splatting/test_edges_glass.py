@@ -220,7 +220,7 @@ def test_glass_that_lets_no_light_through_is_drawn_as_opaque():
     (image, derivative), (glass, pushed_glass) = (pushed(lambda t, a=a: scene(t, a)) for a in (1.0, 0.9999))
     # Where outlines cross, pixels of glass are off by about a tenth.
     assert np.sort(np.abs(glass - image).max(-1).ravel())[-15] < 3e-3
-    assert np.linalg.norm(pushed_glass - derivative) < 0.05 * np.linalg.norm(derivative)
+    assert np.linalg.norm(pushed_glass - derivative) < 0.15 * np.linalg.norm(derivative)
 
 
 def mixed(t):
