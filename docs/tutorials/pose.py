@@ -30,10 +30,10 @@ camera = rts.Camera.look_at((1, 2, 4), (0, 0, 0))
 # %% [markdown]
 # ## The mask
 #
-# Here we make the mask ourselves, so that we know the answer. A file that is white on black is read without a change of
-# its grey: `np.asarray(PIL.Image.open("mask.png").convert("L"), np.float32) / 255`, where 128 means that half of a pixel
-# is covered. Of a cut-out that is transparent around take `rts.load_image("cut.png")[..., 3]`, its alpha. Do not take
-# all four channels of an ordinary picture: its alpha is 1 everywhere, as if the shape filled it.
+# Here we make the mask ourselves, so that we know the answer. A file that is white on black is read without a change
+# of its grey: `np.asarray(PIL.Image.open("mask.png").convert("L"), np.float32) / 255`, where 128 means that half of a
+# pixel is covered. Of a cut-out that is transparent around take `rts.load_image("cut.png")[..., 3]`, its alpha. Do not
+# take all four channels of an ordinary picture: its alpha is 1 everywhere, as if the shape filled it.
 #
 # A pose is six numbers: a rotation vector in radians, then a translation. `rts.rigid` makes a matrix of them.
 
