@@ -183,7 +183,7 @@ def _patched(way):
             patch.setenv("RTS_NUM_THREADS", "4")
             patch.setattr(threads, "LITTLE_WORK", 1)
         if "specified" in way:
-            patch.setattr(edges, "EDGES", edges._specification)
+            patch.setattr(edges, "EDGES", edges.specification)
             patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
             patch.setattr(stack_sides, "SIDES", stack_sides._specification)
         yield

@@ -62,7 +62,7 @@ def test_images_are_in_range_and_those_of_the_specification(kind, first, monkeyp
     for number in range(first, min(first + STEP, LAST)):
         image, slopes = drawn(kind, number)
         with monkeypatch.context() as patch:
-            patch.setattr(edges, "EDGES", edges._specification)
+            patch.setattr(edges, "EDGES", edges.specification)
             expected, known = drawn(kind, number)
         assert_in_range(image)
         np.testing.assert_allclose(image, expected, rtol=0, atol=LIMIT, err_msg=str(number))

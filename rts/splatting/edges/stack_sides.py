@@ -55,7 +55,7 @@ def _from_the_back(color: Array) -> tuple[range, Array]:
 def motion_beside_breaks(positions: Array, rgba: Array, row: Array, outlines: Outlines) -> Array:
     """The change (H, W, C) as colours move between centres and breaks; no value, but the derivative of motions.
 
-    As `_beside_breaks` of `rts.splatting.edges.splatter` for opaque layers, whose own part of it, of the composites
+    As `_beside_breaks` of `rts.splatting.edges.specification` for opaque layers, whose own part, of the composites
     and of the motion of breaks, is taken off. `row` is (K, H, W).
     """
     return SIDES(positions, rgba, row, *(getattr(outlines, name) for name in _Known._fields))

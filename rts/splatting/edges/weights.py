@@ -81,7 +81,7 @@ class _Weights(NamedTuple):
 
 def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
     """The value, and the weights, which the derivatives use again."""
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines = _effective(Outlines(*arrays))
@@ -96,7 +96,7 @@ def forward(operands: Arrays, out: np.ndarray, border: int) -> _Weights:
 
 def push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, kept: _Weights | None) -> None:
     """The derivative of the value along tangents of positions and colours."""
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines = _effective(Outlines(*arrays))
@@ -111,7 +111,7 @@ def _push_outlines(
     operands: Arrays, tangents: Some, outlines: Outlines, weights: _Weights, out: np.ndarray, border: int
 ) -> None:
     """Add to a derivative (h, w, C) what changes at outlines; arguments as of `push`."""
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     _, rgba, row, *_ = operands
     t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
@@ -131,12 +131,12 @@ def _add(
         outlines: on the host.
         weights: of these outlines.
         row: (H, W).
-        samples: colours and positions, or their tangents, and points, or none; see `edges_loops.add_sides`.
-        jumps: constant colours; jumps, constant jumps and motions, see `edges_loops.add_segments`.
+        samples: colours and positions, or their tangents, and points, or none; see `sums_loops.add_sides`.
+        jumps: constant colours; jumps, constant jumps and motions, see `sums_loops.add_segments`.
         out: (h, w, C).
         border: cells around the image.
     """
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     (rgba, positions, points), (steady, *at_breaks) = samples, jumps
     loops.add_segments(border, *_segments(outlines, weights, row), rgba, *at_breaks, out)
@@ -146,7 +146,7 @@ def _add(
 
 def pull(operands: Arrays, g: np.ndarray, results: Some, border: int, kept: _Weights | None) -> None:
     """The gradients of positions and colours."""
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines, g = _effective(Outlines(*arrays)), read_only(g)
@@ -257,14 +257,14 @@ def _effective(outlines: Outlines) -> Outlines:
 
 
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The first operands of `edges_loops.add_segments`."""
+    """The first operands of `sums_loops.add_segments`."""
     ties = outlines.square, outlines.ties, outlines.beyond
     return *ties, weights.share, weights.cell_side, weights.lost, weights.flux, row, weights.shown
 
 
 def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:
     """(B, C) colours before breaks, less those behind."""
-    from rts.splatting.edges import weights_loops as loops
+    from rts.splatting.edges import sums_loops as loops
 
     found = np.empty((len(weights.shown), rgba.shape[1]))
     loops.jumps(rgba, weights.shown, found)
