@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from rts.arrays.array_functions import from_numbers, shape_of, without_border
+from rts.arrays.array_functions import described, from_numbers, shape_of, without_border
 from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array
 from rts.contracts.records import Cells, Splats
@@ -45,7 +45,9 @@ class Splatter(Plugin):
     def cropped(self, splats: Splats) -> Array:
         """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy."""
         image = self.image(splats)
-        return without_border(image, splats.border) if len(shape_of(image)) == 3 else image  # Refused later.
+        if len(shape_of(image)) != 3:
+            raise InputError(f"the image of {self!r} {described(image)}; expected (H, W, C), with the border")
+        return without_border(image, splats.border)
 
     @final
     def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0, opaque: bool = True) -> Array:
