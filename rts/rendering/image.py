@@ -20,7 +20,7 @@ from rts.rendering.outputs import Outputs, fronts_of
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
-from rts.sampling.prepared import Prepared
+from rts.sampling.prepared import Prepared, warn_of_moved_vertices
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -100,6 +100,8 @@ def render(
         LayersWarning: surfaces or light behind the last layer are left out.
     """
     scene, wanted = Scene.of(parts, camera, sampler, engine), None if outputs is None else Outputs(outputs)
+    if isinstance(parts, Prepared):
+        warn_of_moved_vertices(scene.parts, scene.entries)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
     background = check_background(background, size, scene.channels)
     scene = scene.at(size)

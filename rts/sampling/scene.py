@@ -13,7 +13,7 @@ from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.checks import check_ratio, check_sampler, sampler_for_part
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.sampling.prepared import Prepared, warn_of_moved_vertices
+from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -68,7 +68,6 @@ class Scene(NamedTuple):
         warn_of_unread(checked)
         warn_of_winding(checked, camera)
         if prepared:
-            warn_of_moved_vertices(checked, parts.entries)
             fields = parts.samplers, parts.entries
         else:
             sampler_object = check_sampler(sampler)
