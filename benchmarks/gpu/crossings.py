@@ -103,7 +103,7 @@ def names(crossings: list[Crossing]) -> list[str]:
 NUMBERS = "matrices and single numbers"
 _OF_SAMPLES = ("ids", "barycentrics", "row", "depth", "triangle")
 _OF_BREAKS = ("places of breaks", "gaps", "rows of breaks", "points of breaks", "inner rows", "pairs", "near", "slopes")
-_OF_BREAKS += ("ends", "squares", "ties", "sides of squares", "beyond", "corners", "pulls", "joined")
+_OF_BREAKS += ("ends", "squares", "ties", "sides of squares", "hubs", "beyond", "corners", "pulls", "joined")
 ORDER = {
     ("to the device", "in_engine"): (*_OF_SAMPLES, *_OF_BREAKS),
     ("to the host", "value_of"): ("vertices",),

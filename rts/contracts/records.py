@@ -194,10 +194,10 @@ class Request:
     entry: Any = None
 
 
-ON_PREVIOUS, ON_NEXT = 4, 5
-"""In place of the second side of a lone break in `Outlines.square_sides`: it ends at the segment before, or after."""
+REACH = 6
+"""The most rows from a segment to the one in `Outlines.hub`."""
 
-OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
+OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "hub", "beyond", "corner", "pull"})
 """The fields of `Outlines` that have a row for each segment."""
 
 OF_SAMPLES = ("rows", "inner", "pair", "stack")
@@ -232,8 +232,10 @@ class Outlines:
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
             the other. −1 in second place if a break is alone. A segment from a break to itself has no effect.
         square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
-            `ON_PREVIOUS` or `ON_NEXT` in second place if the outline of a lone break ends at the segment before or
-            after it, of the same square: at its own `corner`.
+        hub: (S,) int32, how many rows farther on there is the segment, of the same square, that the outline of a lone
+            break ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `beyond` has the
+            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is the motion of
+            that segment's corner.
         beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
         corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
         pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
@@ -258,6 +260,7 @@ class Outlines:
     square: Array
     ties: Array
     square_sides: Array
+    hub: Array
     beyond: Array
     corner: Array
     pull: Array

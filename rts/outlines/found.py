@@ -41,6 +41,7 @@ class Found(NamedTuple):
     square: Array
     ties: Array
     square_sides: Array
+    hub: Array
     beyond: Array
     corner: Array
     pull: Array
@@ -56,7 +57,8 @@ class Found(NamedTuple):
         breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
         breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
         breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
-        segments = [ArraySpec((ends, 2), integers, packed=True)] * 4
+        pairs = ArraySpec((ends, 2), integers, packed=True)
+        segments = [pairs, pairs, pairs, ArraySpec((ends,), integers, packed=True), pairs]
         segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
         return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
 

@@ -112,6 +112,8 @@ class Breaks(NamedTuple):
         joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
         triangles: (B, 4) int32, the triangles of these samples, in order; −1 where none is known.
         tangent: (B, 2) float64, the outline's unit direction in the image, either way; 0 where it is unknown.
+        cells_away: (B,) float64, how many cells, each as deep as it is wide, the surface that ends is away, but for a
+            constant; 0 where it is unknown.
     """
 
     gap: np.ndarray
@@ -125,6 +127,7 @@ class Breaks(NamedTuple):
     joined: np.ndarray
     triangles: np.ndarray
     tangent: np.ndarray
+    cells_away: np.ndarray
 
 
 class Stacks(NamedTuple):
@@ -216,8 +219,16 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
         joined,
         np.full((len(number), 4), -1, np.int32),
         lines_of_crossing(slope),
+        cells_away(change.depth(near), oracle.width),
     )
     return breaks, change.stacks(near, points, beside)
+
+
+def cells_away(depth: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """`Breaks.cells_away` (B,) at depths (B,); `width` as in `Oracle`."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        away = np.log(width[0] + width[1] * depth) / width[1] if width[1] > 0 else depth / width[0]
+    return np.where(np.isfinite(away), away, 0.0)
 
 
 def lines_of_crossing(slope: np.ndarray) -> np.ndarray:
@@ -360,6 +371,11 @@ class _Change(NamedTuple):
         """(B, 2) int32, the part that moves the break and what is seen behind it, or those that cross, by sides."""
         at = np.where(near == 2, self.first, np.where(near == 1, self.ends[1], self.ends[0]))
         return np.stack([side.of_layer(at).part for side in self.sides], 1)
+
+    def depth(self, near: np.ndarray) -> np.ndarray:
+        """(B,) the depth of the surface that ends, or of one that crosses another."""
+        depths = [side.of_layer(at).depth for side, at in zip(self.sides, self.moves(near), strict=True)]
+        return np.where(near == 1, depths[1], depths[0])
 
     def classified(self, found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[np.ndarray, np.ndarray]:
         """`near` (B,) and `slope` (B, 2, 2) of breaks."""

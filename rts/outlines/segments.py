@@ -17,6 +17,7 @@ class Segments(NamedTuple):
         square: (S, 2) int32.
         ties: (S, 2) int32.
         square_sides: (S, 2) int32.
+        hub: (S,) int32.
         beyond: (S, 2) int32.
         corner: (S, 2) float64.
         pull: (S, 4) float64.
@@ -25,6 +26,7 @@ class Segments(NamedTuple):
     square: np.ndarray
     ties: np.ndarray
     square_sides: np.ndarray
+    hub: np.ndarray
     beyond: np.ndarray
     corner: np.ndarray
     pull: np.ndarray
@@ -43,10 +45,12 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
     order = np.argsort(group + 1j * along, kind="stable")  # By both parts, and faster than lexsort.
     known = breaks.place, breaks.tangent
-    origin, ties, square_sides, around = loops.segments_of(order, group, square, ends, *known, size[1])
+    of_breaks = *known, breaks.cells_away
+    origin, ties, square_sides, around = loops.segments_of(order, group, square, ends, *of_breaks, size[1])
     triangle = loops.ending(breaks.near, breaks.parts, breaks.triangles)
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
     filled = origin, ties, square_sides, around, *known, triangle, corner, pull
     parallel(loops.corners, len(ties), *filled, work=150 * len(ties))
-    loops.meet(origin, ties, square_sides, *known, corner)
-    return Segments(origin, ties, square_sides, np.ascontiguousarray(around[:, 1:3]), corner, pull)
+    hub = np.zeros(len(ties), np.int32)
+    loops.meet(origin, ties, square_sides, *known, hub, corner, pull, around)
+    return Segments(origin, ties, square_sides, hub, np.ascontiguousarray(around[:, 1:3]), corner, pull)

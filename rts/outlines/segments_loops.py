@@ -5,13 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.contracts.records import ON_NEXT, ON_PREVIOUS
+from rts.contracts.records import REACH
 
-LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND = 2.0, 1.5, 0.5, 1.0
+LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
 """Costs, in cells, beside the length of segments: a break that stays alone; a segment between two breaks on one side,
 which may be the two edges of something thin; one between breaks with different parts behind them; one between an
-outline and a line where surfaces cross."""
+outline and a line where surfaces cross; one between surfaces that end far from one another along the ray, of which half
+counts for those `FAR` cells apart."""
 
+ON_FRONT = 1.0
+"""How much farther off its way, in cells, an outline counts to end at a segment on the side of what this bounds."""
+
+
+FAR = 4.0
+"""Cells along a ray, each as deep as it is wide; see `OTHER_DEPTH`."""
 
 ASIDE = 0.4
 """Share of a cost that is by how far a segment leads off the direction of an outline at its end; the rest is by its
@@ -69,7 +76,7 @@ def ends_of(gap, place, near, parts, height, width):
 
 
 @compiled
-def _join(begins, ends, place, tangent, partner):
+def _join(begins, ends, place, tangent, cells_away, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts cross,
@@ -81,12 +88,13 @@ def _join(begins, ends, place, tangent, partner):
         ends: (E, 5), see `ends_of`; clockwise in each square.
         place: (B, 2) x and y of breaks.
         tangent: (B, 2) unit directions of outlines there, either way; 0 where they are unknown.
+        cells_away: (B,), see `Breaks.cells_away`.
         partner: (E,) int32, filled with −1.
     """
     for q in range(len(begins) - 1):
         first, n = begins[q], begins[q + 1] - begins[q]
         if n == 2:
-            if _cost(first, first + 1, ends, place, tangent) < 2 * LONE:
+            if _cost(first, first + 1, ends, place, tangent, cells_away) < 2 * LONE:
                 partner[first], partner[first + 1] = first + 1, first
             continue
         if n < 2:
@@ -97,7 +105,7 @@ def _join(begins, ends, place, tangent, partner):
             for i in range(n - m + 1):
                 best, choice = LONE + least[i + 1, m - 1], -1
                 for k in range(1, m):
-                    cost = _cost(first + i, first + i + k, ends, place, tangent)
+                    cost = _cost(first + i, first + i + k, ends, place, tangent, cells_away)
                     cost += least[i + 1, k - 1] + least[i + k + 1, m - k - 1]
                     best, choice = (cost, k) if cost < best else (best, choice)
                 least[i, m], step[i, m] = best, choice
@@ -105,7 +113,7 @@ def _join(begins, ends, place, tangent, partner):
 
 
 @compiled
-def _cost(a, b, ends, place, tangent):
+def _cost(a, b, ends, place, tangent, cells_away):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
     other_front, other_back = ends[b, 3], ends[b, 4]
@@ -123,7 +131,8 @@ def _cost(a, b, ends, place, tangent):
         aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
         cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
     cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
-    return cost + OTHER_KIND * crosses
+    apart = abs(cells_away[p] - cells_away[q])
+    return cost + OTHER_KIND * crosses + OTHER_DEPTH * apart / (apart + FAR)
 
 
 @compiled
@@ -146,7 +155,7 @@ def _read(first, n, step, partner):
 
 
 @loop
-def segments_of(order, group, square, ends, place, tangent, width):
+def segments_of(order, group, square, ends, place, tangent, cells_away, width):
     """The segments between ends, those of a square after those of the one before; see `outlines.segments.Segments`.
 
     Args:
@@ -156,6 +165,7 @@ def segments_of(order, group, square, ends, place, tangent, width):
         ends: (E, 5), see `ends_of`.
         place: (B, 2) x and y of breaks.
         tangent: (B, 2), see `_join`.
+        cells_away: (B,), see `Breaks.cells_away`.
         width: number of centres in a line.
 
     Returns:
@@ -171,7 +181,7 @@ def segments_of(order, group, square, ends, place, tangent, width):
             sorted_ends[e, i] = ends[order[e], i]
     begins[several] = count
     partner = np.full(count, -1, np.int32)
-    _join(begins[: several + 1], sorted_ends, place, tangent, partner)
+    _join(begins[: several + 1], sorted_ends, place, tangent, cells_away, partner)
     origin = np.empty((count, 2), np.int32)
     ties, square_sides = np.full((count, 2), -1, np.int32), np.full((count, 2), -1, np.int32)
     found = 0
@@ -349,48 +359,135 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
 
 
 @compiled
-def _in_one_square(origin, s, t):
-    """True if two segments, of which the second may be beyond the list, are in one square."""
-    return 0 <= t < len(origin) and origin[s, 0] == origin[t, 0] and origin[s, 1] == origin[t, 1]
-
-
-@compiled
 def _towards(start, way, a, b):
     """The point of a straight piece from a to b that is seen nearest along a direction from a point.
 
     Returns:
-        The point; how far it is off the line in this direction; and how far ahead along it.
+        Where on the piece it is, 0 to 1; how far it is off the line in this direction; and how far ahead along it.
     """
     piece, off = _minus(b, a), _minus(a, start)
     turn = way[0] * piece[1] - way[1] * piece[0]
     t = (off[0] * way[1] - off[1] * way[0]) / turn if turn != 0 else 0.5
     t = min(max(t, 0.0), 1.0)
-    point = a[0] + t * piece[0], a[1] + t * piece[1]
-    dx, dy = _minus(point, start)
+    dx, dy = off[0] + t * piece[0], off[1] + t * piece[1]
     ahead = way[0] * dx + way[1] * dy
-    return point, abs(way[0] * dy - way[1] * dx) + max(-ahead, 0.0), ahead
+    return t, abs(way[0] * dy - way[1] * dx) + max(-ahead, 0.0), ahead
+
+
+@compiled
+def _around(point, origin, s, side):
+    """A place on the sides of a segment's square, clockwise from the upper left corner, 0 to 4."""
+    x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
+    return x if side == 0 else (1 + y if side == 1 else (3 - x if side == 2 else 4 - y))
+
+
+@compiled
+def _between(at, start, end):
+    """True if a place on the sides of a square comes after `start` and before `end`, clockwise."""
+    return start < at < end if start < end else at > start or at < end
+
+
+@compiled
+def _on_segment(origin, s, e, ties, place, corner):
+    """The end e of a segment, and its corner, from the square's first centre."""
+    left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
+    end = _row(place, ties[s, e])
+    return (end[0] - left, end[1] - top), _row(corner, s)
+
+
+@compiled
+def _end_at(s, other, way, origin, ties, place, around, corner):
+    """Where the outline of the lone break of a segment would end at another one; see `meet`.
+
+    Returns:
+        A place on the other segment, 0 to 2, its corner at 1; how far it is off the way, and how far ahead.
+    """
+    best, least, nearest = 1.0, np.inf, np.inf
+    start = _on_segment(origin, s, 0, ties, place, corner)[0]
+    for e in range(2):
+        end, middle = _on_segment(origin, other, e, ties, place, corner)
+        t, off, ahead = _towards(start, way, end, middle)
+        if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
+            best, least, nearest = t if e == 0 else 2 - t, off, ahead
+    # What the other segment bounds lies on the right of its way, and hides what is behind on its left.
+    hidden = _between(around[s, 0], around[other, 0], around[other, 1])
+    return best, least + (0.0 if hidden else ON_FRONT), nearest
+
+
+@compiled
+def _apart(first, stop, s, other, ties, around):
+    """True if a segment of the same square lies between the start of s and another one."""
+    for c in range(first, stop):
+        low, high = min(around[c, 0], around[c, 1]), max(around[c, 0], around[c, 1])
+        if c != other and ties[c, 1] >= 0 and (low < around[s, 0] < high) != (low < around[other, 0] < high):
+            return True
+    return False
+
+
+@compiled
+def _crossing(s, other, origin, ties, place, corner):
+    """Where a segment crosses another one: the place on that one, 0 to 2, its corner at 1; −1 if it does not."""
+    for e in range(2):
+        a, b = _on_segment(origin, other, e, ties, place, corner)
+        piece = _minus(b, a)
+        for d in range(2):
+            start, end = _on_segment(origin, s, d, ties, place, corner)
+            way, off = _minus(end, start), _minus(a, start)
+            turn = way[0] * piece[1] - way[1] * piece[0]
+            if turn == 0:
+                continue
+            t, u = (off[0] * way[1] - off[1] * way[0]) / turn, (off[0] * piece[1] - off[1] * piece[0]) / turn
+            if 0 <= t <= 1 and 0 <= u <= 1:
+                return t if e == 0 else 2 - t
+    return -1.0
 
 
 @loop
-def meet(origin, ties, square_sides, place, tangent, corner):
-    """Let a break that is alone beside one segment in its square end there: fill in its second side, and its corner.
+def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
+    """Fill in `hub` (S,), and what else `Outlines` has of the segments with one; other arguments are as of `corners`.
 
-    Its outline is hidden by what the segment bounds. It goes on along its tangent, as near as the segment allows.
-    Arguments are as of `corners`.
+    A break that is alone ends at a segment of its square, which hides the rest of its outline. This goes on along its
+    tangent to the first segment that is there, or as near as one allows. Where light passes through, outlines cross.
+    `beyond` is (S, 4), the result of `_beyond`.
     """
-    for s in range(len(ties)):
-        other = s - 1 if _in_one_square(origin, s, s - 1) else s + 1
-        beyond = 2 * s - other
-        if ties[s, 1] >= 0 or not _in_one_square(origin, s, other) or _in_one_square(origin, s, beyond):
-            continue
-        if ties[other, 1] < 0 or _in_one_square(origin, s, 2 * other - s):
-            continue
-        left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
-        start, middle = _row(place, ties[s, 0]), (corner[other, 0] + left, corner[other, 1] + top)
-        way, meeting, least, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), middle, np.inf, np.inf
+    count, first = len(ties), 0
+    around, on = np.zeros((count, 2)), np.zeros(count)
+    for s in range(count):
         for e in range(2):
-            there, off, ahead = _towards(start, way, _row(place, ties[other, e]), middle)
-            if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
-                meeting, least, nearest = there, off, ahead
-        square_sides[s, 1] = ON_PREVIOUS if other < s else ON_NEXT
-        corner[s, 0], corner[s, 1] = min(max(meeting[0] - left, 0.0), 1.0), min(max(meeting[1] - top, 0.0), 1.0)
+            if ties[s, e] >= 0:
+                around[s, e] = _around(_row(place, ties[s, e]), origin, s, square_sides[s, e])
+    while first < count:
+        stop = first + 1
+        while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
+            stop += 1
+        for s in range(first, stop) if stop - first > 1 else range(0):
+            way, least, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), np.inf, np.inf
+            for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
+                if ties[other, 1] < 0 or other == s:
+                    continue
+                if ties[s, 1] >= 0:
+                    low, high = min(around[other, 0], around[other, 1]), max(around[other, 0], around[other, 1])
+                    crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)
+                    if other < s and crosses and hub[s] == 0 and hub[other] == 0:
+                        on[s] = _crossing(s, other, origin, ties, place, corner)
+                        hub[s] = other - s if on[s] >= 0 else 0
+                    continue
+                t, off, ahead = _end_at(s, other, way, origin, ties, place, around, corner)
+                if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
+                    if not _apart(first, stop, s, other, ties, around):
+                        hub[s], on[s], least, nearest = other - s, t, off, ahead
+        first = stop
+    for s in range(count):
+        if hub[s] != 0 and hub[s + hub[s]] != 0:
+            hub[s] = 0  # What crosses another one is no hub.
+    for s in range(count):
+        if hub[s] == 0:
+            continue
+        other, e = s + hub[s], 0 if on[s] < 1 else 1
+        share = on[s] if e == 0 else 2 - on[s]
+        end, middle = _on_segment(origin, other, e, ties, place, corner)
+        for a in range(2):
+            corner[s, a] = min(max((1 - share) * end[a] + share * middle[a], 0.0), 1.0)
+            beyond[s, 1 + a] = ties[other, a]
+        pull[s, 0], pull[s, 3] = pull[other, 0] + pull[other, 1], pull[other, 2] + pull[other, 3]
+        pull[s, 1], pull[s, 2] = 0.0, 0.0

@@ -197,11 +197,11 @@ def on_planes(first, last, triangles, points, rows, vertices, faces, weights, de
         _, weights[m, 0], weights[m, 1] = weights_at(corners, sign, points[m, 0], points[m, 1])
         depths[m] = plane_at(corners, sign, points[m, 0], points[m, 1])[0]
         if sign == 0:
-            depths[m], weights[m, 0], weights[m, 1] = _on_edges(corners, points[m, 0], points[m, 1])
+            depths[m], weights[m, 0], weights[m, 1] = on_edges(corners, points[m, 0], points[m, 1])
 
 
 @compiled
-def _on_edges(corners, x, y):
+def on_edges(corners, x, y):
     """Depth and first two barycentrics of the point of a triangle's edges that is seen nearest to a position."""
     least, z, shares, best = np.inf, 0.0, np.zeros(3), np.zeros(3)
     for k in range(3):

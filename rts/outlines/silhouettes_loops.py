@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.sheets_loops import plane_at
+from rts.outlines.sheets_loops import on_edges, plane_at
 from rts.sampling.points_loops import corners_of, edge
 
 SLACK = 0.01
@@ -190,7 +190,7 @@ def edges(first, last, near, parts, triangles, points, own, rows, vertices, face
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         slope: (B, 2, 2) to fill where surfaces cross: slopes of depth along x and y, a cell.
-        depth: (B,) to fill where surfaces cross.
+        depth: (B,) to fill: of the surface that ends, or where surfaces cross.
         tangent: (B, 2) to fill: along the nearest edge of the triangle that ends, or of the one before.
     """
     corners = np.empty((3, 4))
@@ -204,6 +204,8 @@ def edges(first, last, near, parts, triangles, points, own, rows, vertices, face
             if near[b] == 2:
                 # Not a number where a triangle is seen edge-on.
                 depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
+            else:
+                depth[b] = on_edges(corners, x, y)[0]
             if ends:
                 tangent[b, 0], tangent[b, 1] = _nearest_edge(corners, sign, x, y)
 

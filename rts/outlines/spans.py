@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel, read_only
-from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps
+from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, cells_away
 from rts.outlines.sheets import Sheets
 
 
@@ -48,9 +48,9 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
     fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends)
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False  # Elsewhere one surface goes on from centre to centre.
-    slope, tangent = moving_edges(near, beside, triangles, points[:, 0], sheets, width)
+    slope, tangent, away = moving_edges(near, beside, triangles, points[:, 0], sheets, width)
     place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]
-    return Breaks(gap, place, near, slope, ends, last, inner, beside, joined, triangles, tangent)
+    return Breaks(gap, place, near, slope, ends, last, inner, beside, joined, triangles, tangent, away)
 
 
 def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -74,8 +74,8 @@ def moving_edges(
     points: np.ndarray,
     sheets: Sequence[Sheets],
     width: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """`Breaks.slope` and `Breaks.tangent`: along the edge of the triangle that ends there, or where two planes cross.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`Breaks.slope`, `tangent` and `cells_away`: of the edge of the triangle that ends, or where two planes cross.
 
     Args:
         near: `Breaks.near`. It becomes 0 where surfaces that cross hardly differ in slope.
@@ -92,4 +92,4 @@ def moving_edges(
     for sheet in sheets:
         sheet.edges(near, *known, slope, depth, tangent)
     silhouettes_loops.settle(width, depth, near, slope, tangent)
-    return slope, tangent
+    return slope, tangent, cells_away(depth, width)

@@ -37,11 +37,12 @@ def breaks_of_stacks(
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
     at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
-    slope, tangent = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
+    slope, tangent, away = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
     ends, last_points = whole[:, 4:] == 1, points[:, :2]
-    breaks = Breaks(gap, at, near, slope, ends, last_points, last_points, whole[:, 2:4], joined, triangles, tangent)
+    samples_of = last_points, last_points, whole[:, 2:4], joined, triangles
+    breaks = Breaks(gap, at, near, slope, ends, *samples_of, tangent, away)
     numbers = np.zeros(samples.shape[:2], np.int32)
     return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides, numbers)
 

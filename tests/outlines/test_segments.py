@@ -31,7 +31,7 @@ def segments_between(gap, place, near):
     parts = np.where(near[:, None] == [0, 1], 0, -1).astype(np.int32)
     square, along, ends = loops.ends_of(gap, place, near, parts, 5, WIDTH)
     order = np.lexsort((along, square))
-    return loops.segments_of(order, square, square, ends, place, np.zeros((len(place), 2)), WIDTH)
+    return loops.segments_of(order, square, square, ends, place, np.zeros((len(place), 2)), np.zeros(len(place)), WIDTH)
 
 
 @pytest.mark.parametrize("near", [0, 1])

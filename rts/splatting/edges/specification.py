@@ -21,16 +21,19 @@ Where light passes through, C and the colours on both sides of a break are compo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
-from rts.contracts.records import ON_NEXT, ON_PREVIOUS, Outlines
+from rts.contracts.records import REACH, Outlines
 from rts.splatting.cells import centres, unpack
 from rts.splatting.edges.weights import BORDER
+
+STEPS = tuple(step for step in range(-REACH, REACH + 1) if step)
+"""From a segment's row to those of segments that may end at it, or cross it."""
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
@@ -57,7 +60,12 @@ def specification(positions: Array, rgba: Array, row: Array, *arrays: Array, bor
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
     # Inductor of torch 2.13, with free sizes, reads sums in another shape before it has made them.
-    return without_border(xp.reshape(xp.reshape(image, sums.shape) + sums, image.shape), border)
+    found = xp.reshape(image, sums.shape) + sums
+    # Where many outlines meet, lines for them may cross inside a cell, and take a little of it twice.
+    alpha = stopped(found[:, -1:])
+    settled = xp.where(sums[:, -1:] != 0, xp.clip(alpha, 0.0, 1.0) - alpha, 0.0)
+    found = xp.concat([found[:, :-1], found[:, -1:] + stopped(settled)], axis=-1)
+    return without_border(xp.reshape(found, image.shape), border)
 
 
 def _on_cells(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array]:
@@ -143,7 +151,7 @@ class _Breaks(NamedTuple):
 class _Segments(NamedTuple):
     """Segments, each from a break to another; or from a lone break straight across its square, of which half counts.
 
-    The outline of a lone break may also end at another segment, behind its surface. Then three outlines meet there.
+    Segments may also end at another one, behind its surface, or cross it.
 
     Attributes:
         square: (S, 2) int, x and y of the first corner's cell.
@@ -157,9 +165,10 @@ class _Segments(NamedTuple):
         next: (4, 2, S) int, the side of the breaks, 0 or 1, that a corner of the square is next to, or −1.
         seen: (2, S, 2) bool, is there a sample on these sides?
         moves: (3, S, 2), the motion of start, corner and end.
-        given: (S, 2), `Outlines.corner`.
-        hidden: (S,) bool, does a lone break's outline end at another segment? There is `given`.
-        meets: (S,) int, the hidden segment that ends at each, or −1.
+        beyond: (2, S, 2), the motions of the breaks in `Outlines.beyond`.
+        number: (S,) int, the segments' own rows.
+        hub: (S,) int, the row of the segment that each ends at, or crosses, in its corner; or −1.
+        meets: (S,) bool, do others end at the segment, or cross it?
     """
 
     square: Array
@@ -173,20 +182,21 @@ class _Segments(NamedTuple):
     next: Array
     seen: Array
     moves: Array
-    given: Array
-    hidden: Array
+    beyond: Array
+    number: Array
+    hub: Array
     meets: Array
 
     @classmethod
     def of(cls, outlines: Outlines, breaks: _Breaks) -> _Segments:
         """The segments between breaks."""
         xp, side = namespace(breaks.place), outlines.square_sides
-        alone, number = outlines.ties[:, 1] < 0, engine_of(side).arange(side.shape[0], outlines.corner)
-        hidden, number = alone & (side[:, 1] >= 0), xp.astype(number, side.dtype)
-        earlier = xp.roll(alone & (side[:, 1] == ON_NEXT), 1, axis=0)
-        later = xp.roll(alone & (side[:, 1] == ON_PREVIOUS), -1, axis=0)
-        meets = xp.where(later, number + 1, xp.where(earlier, number - 1, -1))
         lone, first = outlines.ties[:, 1] < 0, outlines.ties[:, 0]
+        number = xp.astype(engine_of(side).arange(side.shape[0], outlines.corner), side.dtype)
+        hub = xp.where(outlines.hub != 0, number + outlines.hub, -1)
+        meets = xp.zeros_like(lone)
+        for step in STEPS:
+            meets = meets | (xp.roll(hub, -step, axis=0) == number)
         ties = xp.stack([first, xp.where(lone, first, outlines.ties[:, 1])], axis=-1)
         side = xp.stack([side[:, 0], xp.where(lone, (side[:, 0] + 2) % 4, side[:, 1])], axis=-1)
         square = xp.stack([outlines.square[:, 1], outlines.square[:, 0]], axis=-1)
@@ -195,7 +205,7 @@ class _Segments(NamedTuple):
         along = xp.take(breaks.step, ties[:, 0], axis=0)
         end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
         start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
-        corner = xp.where(lone[:, None], (start + end) / 2, outlines.corner)
+        corner = xp.where((lone & (hub < 0))[:, None], (start + end) / 2, outlines.corner)
         jump, right, turned, moves = [], [], [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
@@ -217,7 +227,7 @@ class _Segments(NamedTuple):
         moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
         path = xp.stack([start, corner, end])
         sides = xp.stack(jump), xp.stack(right), xp.stack(turned), beside, seen
-        return cls(square, lone, path, side, ties, *sides, xp.stack(moves), outlines.corner, hidden, meets)
+        return cls(square, lone, path, side, ties, *sides, xp.stack(moves), xp.stack(beyond), number, hub, meets)
 
     def parts(self, color: Array) -> list[tuple[Array, Array, Array]]:
         """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
@@ -248,62 +258,78 @@ class _Segments(NamedTuple):
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
             differs = xp.where(self._knows(k, on_right)[:, None], centre - (beside[0] + beside[1]) / 2, 0.0)
             change = change + share * mean - xp.abs(share) * differs
-            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone | self.hidden | (self.meets >= 0)
+            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone | (self.hub >= 0) | self.meets
             parts.append((x, y, xp.where(nothing[:, None], 0.0, change)))
         return parts
 
     def meetings(self, color: Array) -> list[tuple[Array, Array, Array]]:
-        """Changes as of `parts`, of segments at which another one ends, and of these.
+        """Changes as of `parts`, of segments at which others end, or which others cross, and of these.
 
-        Three outlines go from their breaks to a point, and three surfaces lie between them. Clockwise around the
-        square, the colour rises by a jump at each break; what is on the way from there to the point counts against it.
+        All these outlines go from their breaks to the segment's corner, and as many surfaces lie between them.
+        Clockwise around the square, the colour rises by a jump at each break; what is on the way from there to the
+        corner counts against it.
         """
         xp, parts, rays = namespace(self.path), [], self._rays()
-        there, other = self.meets >= 0, xp.where(self.meets >= 0, self.meets, 0)
-        flat = xp.reshape(color, (-1, color.shape[2]))
+        flat, count = xp.reshape(color, (-1, color.shape[2])), self.number.shape[0]
+        counts = [self.meets | (self.hub >= 0), self.meets | (self.hub >= 0) & ~self.lone]
+        side, place = (xp.concat([getattr(ray, name) for ray in rays]) for name in ("side", "place"))
+        before, after = (xp.concat([getattr(ray, name) for ray in rays]) for name in ("before", "after"))
+        seen = xp.concat([self.seen[0], self.seen[1]])
+        # Both rays of each segment, and of those beside it in the list, of which some end at it or cross it.
+        near, there = [self.number, count + self.number], [self.meets, self.meets]
+        for step in STEPS:
+            row = xp.clip(self.number + step, 0, count - 1)
+            here = (xp.take(self.hub, row) == self.number) & (row == self.number + step)
+            near, there = [*near, row, count + row], [*there, here, here & ~xp.take(self.lone, row)]
+        near, there = xp.stack(near), xp.stack(there)
         for k, (dx, dy) in enumerate(CORNERS):
-            change, ends, x, y = 0.0, [], self.square[:, 0] + dx, self.square[:, 1] + dy
-            for e, ray in enumerate(rays):
-                weight, flux = ray.onto(k)
-                counts = there | self.hidden if e == 0 else there
-                change = change + xp.where(counts[:, None], flux - weight[:, None] * ray.jump, 0.0)
-                ends.append((ray, weight, self.next[k, e], self.seen[e]))
-            ray, weight, next_, seen = ends[0]
-            hidden = (xp.take(x, other, axis=0) for x in (*ray.around(), weight, next_, seen))
-            around = [(*ray.around(), *own) for ray, *own in ends] + [tuple(hidden)]
-            keyed = [(side < k, place, side, *rest) for place, side, *rest in around]
-            before, after = _farthest(xp, keyed, 1), _farthest(xp, keyed, -1)
-            known = xp.zeros_like(there)
-            fails = xp.zeros_like(there)
-            for clockwise, (_, _, side, _, _, _, next_, seen) in ((True, before), (False, after)):
-                expected = xp.where((side < 2) == clockwise, 1, 0)
-                known = known | (next_ == expected)
-                fails = fails | (next_ == 1 - expected) | ~xp.where(expected == 0, seen[:, 0], seen[:, 1])
-            beside = (before[4] + after[3]) / 2
+            x, y = self.square[:, 0] + dx, self.square[:, 1] + dy
+            weights, fluxes = zip(*(ray.onto(k) for ray in rays), strict=True)
+            changes = [f - w[:, None] * ray.jump for w, f, ray in zip(weights, fluxes, rays, strict=True)]
+            change = sum(xp.where(c[:, None], x, 0.0) for c, x in zip(counts, changes, strict=True))
+            weight, next_ = xp.concat(list(weights)), xp.concat([self.next[k, 0], self.next[k, 1]])
+            # Sides break ties of places in corners, which two of them share.
+            keys = xp.where(side < k, 8.0, 0.0) + place + 1e-5 * xp.astype(side, place.dtype)
+            keys = xp.reshape(xp.take(keys, xp.reshape(near, (-1,))), near.shape)
+            known, fails, around = xp.zeros_like(self.meets), xp.zeros_like(self.meets), []
+            for clockwise, beyond in ((True, xp.where(there, keys, -1.0)), (False, -xp.where(there, keys, 99.0))):
+                best = xp.astype(xp.argmax(beyond, axis=0), self.number.dtype) * count + self.number
+                ray = xp.take(xp.reshape(near, (-1,)), best)
+                expected = xp.where((xp.take(side, ray) < 2) == clockwise, 1, 0)
+                found, sees = xp.take(next_, ray), xp.take(seen, ray, axis=0)
+                known = known | (found == expected)
+                fails = fails | (found == 1 - expected) | ~xp.where(expected == 0, sees[:, 0], sees[:, 1])
+                around.append(ray)
+            beside = (xp.take(after, around[0], axis=0) + xp.take(before, around[1], axis=0)) / 2
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
-            lost = xp.clip(after[5] - before[5], 0.0, None)
-            own = xp.where(there & known & ~fails, lost, 0.0)[:, None] * (centre - beside)
+            lost = xp.clip(xp.take(weight, around[1]) - xp.take(weight, around[0]), 0.0, None)
+            own = xp.where(self.meets & known & ~fails, lost, 0.0)[:, None] * (centre - beside)
             parts.append((x, y, change - own))
         return parts
 
     def _rays(self) -> list[_Ray]:
-        """The outlines from start and end of each segment to where it meets another; only the first of hidden ones."""
-        xp = namespace(self.path)
-        there, other = (self.meets >= 0)[:, None], xp.where(self.meets >= 0, self.meets, 0)
-        at = xp.where(there, xp.take(self.given, other, axis=0), self.given)
-        (first, near), (second, far) = (_along(self.path[i], self.given, at) for i in (0, 2))
+        """The outlines from start and end of each segment to its corner, or to that of the one it ends at or crosses.
+
+        They run along that one from where they meet it, and move there as that does.
+        """
+        xp, places, alone = namespace(self.path), self._places(), (self.hub < 0)[:, None]
+        hub = xp.take(self.path, xp.where(self.hub >= 0, self.hub, self.number), axis=1)
+        at, until, rays = self.path[1], self.moves[1], []
+        (first, near), (second, far) = (_along(hub[i], hub[1], at) for i in (0, 2))
         starts = near <= far
-        t, own = xp.where(starts, first, second)[:, None], xp.where(starts[:, None], self.moves[0], self.moves[2])
-        moved, rays = (1 - t) * own + t * self.moves[1], []
-        for e, straight in enumerate((self.hidden | starts, ~starts)):
-            start, move, straight = self.path[2 * e], self.moves[2 * e], straight[:, None]
-            end = xp.where(self.hidden[:, None], move, moved)
-            points = xp.stack([start, xp.where(straight, (start + at) / 2, self.given), at])
-            moves = xp.stack([move, xp.where(straight, (move + end) / 2, self.moves[1]), end])
-            side, jump = self.square_sides[:, e], (self.jump[0] if e == 0 else -self.jump[1])
-            left = self.right[e] - self.jump[e]
+        t, own = xp.where(starts, first, second)[:, None], xp.where(starts[:, None], *self.beyond)
+        share = _along(self.path[0], self.path[2], at)[0][:, None]
+        share = xp.where(self.lone[:, None], 0.0, share)
+        there = (1 - share) * self.moves[0] + share * self.moves[2]
+        for e in (0, 1):
+            start, move = self.path[2 * e], self.moves[2 * e]
+            points = xp.stack([start, xp.where(alone, (start + at) / 2, at), hub[1]])
+            middle = (move + until) / 2
+            onto, along = xp.where(alone, middle, there), xp.where(alone, middle, (1 - t) * own + t * until)
+            jump, left = (self.jump[0] if e == 0 else -self.jump[1]), self.right[e] - self.jump[e]
             after, before = (left, self.right[e]) if e == 0 else (self.right[e], left)
-            rays.append(_Ray(points, moves, jump, side, self._places()[e], before, after))
+            moves = (move, onto), (along, until)
+            rays.append(_Ray(points, moves, jump, self.square_sides[:, e], places[e], before, after))
         return rays
 
     def _knows(self, k: int, on_right: Array) -> Array:
@@ -362,7 +388,7 @@ class _Segments(NamedTuple):
         length = xp.sum(chord * chord, axis=-1)
         turn = xp.sum((self.path[1] - self.path[0]) * chord, axis=-1) / xp.where(length > 0, length, 1.0)
         shares = xp.zeros_like(turn), turn, xp.ones_like(turn)
-        for at, way, moves, (i, t) in _cut(self.path, self.moves):
+        for at, way, moves, (i, t) in _cut(self.path, (self.moves[:2], self.moves[1:])):
             u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
             flux = moves[:, 0] * way[:, 1] - moves[:, 1] * way[:, 0]
             # A lone break's edge ends amid the square.
@@ -377,7 +403,7 @@ class _Ray(NamedTuple):
 
     Attributes:
         points: (3, S, 2), the break, a point between, and the end.
-        moves: (3, S, 2), their motions.
+        moves: the motions (S, 2) of both ends of both pieces.
         jump: (S, C), the colour on the right of the way less that on the left.
         side: (S,) the side of the square.
         place: (S,) the place of the break on the sides, clockwise.
@@ -386,16 +412,12 @@ class _Ray(NamedTuple):
     """
 
     points: Array
-    moves: Array
+    moves: Sequence[Sequence[Array]]
     jump: Array
     side: Array
     place: Array
     before: Array
     after: Array
-
-    def around(self) -> tuple[Array, Array, Array, Array]:
-        """Place, side, and the colours before and after the break."""
-        return self.place, self.side, self.before, self.after
 
     def onto(self, k: int) -> tuple[Array, Array]:
         """By how much the colour of the quarter at corner k rises with the jump, clockwise (S,); the flux (S, C)."""
@@ -415,8 +437,13 @@ class _Ray(NamedTuple):
         return weight, flux
 
 
-def _cut(points: Array, motions: Array) -> list[tuple[Array, Array, Array, tuple[int, Array]]]:
-    """Straight pieces of paths (3, S, 2), cut where pixels meet: middles, ways, motions (S, 2); places on the path."""
+def _cut(
+    points: Array, motions: Sequence[Sequence[Array] | Array]
+) -> list[tuple[Array, Array, Array, tuple[int, Array]]]:
+    """Straight pieces of paths (3, S, 2), cut where pixels meet: middles, ways, motions (S, 2); places on the path.
+
+    `motions` are those of both ends of both pieces.
+    """
     xp, pieces = namespace(points), []
     for i in (0, 1):
         start, way = points[i], points[i + 1] - points[i]
@@ -428,7 +455,7 @@ def _cut(points: Array, motions: Array) -> list[tuple[Array, Array, Array, tuple
         bounds = [xp.zeros_like(cuts[0]), *cuts, xp.ones_like(cuts[0])]
         for low, high in zip(bounds[:-1], bounds[1:], strict=True):
             t = ((low + high) / 2)[:, None]
-            moves = (1 - t) * motions[i] + t * motions[i + 1]
+            moves = (1 - t) * motions[i][0] + t * motions[i][1]
             pieces.append((start + t * way, (high - low)[:, None] * way, moves, (i, t)))
     return pieces
 
@@ -441,20 +468,6 @@ def _along(start: Array, end: Array, point: Array) -> tuple[Array, Array]:
     t = xp.clip(xp.where(square > 0, t, 0.0), 0.0, 1.0)
     off = start + t[:, None] * way - point
     return t, xp.sum(off * off, axis=-1)
-
-
-def _farthest(xp: Any, rows: Sequence[tuple[Array, ...]], sign: int) -> tuple[Array, ...]:
-    """The rows with the largest keys, their first three arrays, or with −1 the least; element by element."""
-    best = rows[0]
-    for row in rows[1:]:
-        beyond, same = False, True
-        for one, other in zip(row[:3], best[:3], strict=True):
-            one, other = (xp.astype(x, row[1].dtype) for x in (one, other))
-            beyond, same = beyond | (same & (sign * one > sign * other)), same & (one == other)
-        best = tuple(
-            xp.where(xp.reshape(beyond, (-1,) + (1,) * (x.ndim - 1)), x, y) for x, y in zip(row, best, strict=True)
-        )
-    return best
 
 
 def _next(k: int, ties: Array, side: Array, lone: Array, ends: Array) -> Array:

@@ -121,7 +121,7 @@ def _shape(
 EDGES = Operation(
     "rts.edges",
     specification,
-    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
+    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 1, 2, 2, 2, 3),
     shape=_shape,
     forward=edges_weights.forward,
     push=edges_weights.push,

@@ -222,7 +222,10 @@ def add_segments(
 
 @loop
 def settle(border, square, rounding, out):
-    """Make numbers of cells beside segments 0 or 1 that differ from these by rounding: below 0, and alpha above 1."""
+    """Make alpha of cells beside segments at most 1 and at least 0; other numbers 0 that are below by rounding.
+
+    Where many outlines meet, lines for them may cross inside a cell, and take a little of it twice.
+    """
     for s in range(len(square)):
         for k in range(4):
             i, j = square[s, 0] + (k >= 2) - border, square[s, 1] + (k == 1 or k == 2) - border
@@ -230,8 +233,7 @@ def settle(border, square, rounding, out):
                 continue
             for c in range(out.shape[2]):
                 out[i, j, c] = 0.0 if -rounding < out[i, j, c] < 0 else out[i, j, c]
-            alpha = out[i, j, out.shape[2] - 1]
-            out[i, j, out.shape[2] - 1] = 1.0 if 1 < alpha < 1 + rounding else alpha
+            out[i, j, out.shape[2] - 1] = min(max(out[i, j, out.shape[2] - 1], 0.0), 1.0)
 
 
 @loop

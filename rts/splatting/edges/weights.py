@@ -69,7 +69,7 @@ class _Weights(NamedTuple):
         of_samples = outlines.rows, outlines.inner, outlines.pair, outlines.points
         loops.weigh_breaks(gap, near, outlines.slope, *of_samples, shown, points, movers, origins, moves)
         ties = outlines.ties
-        geometry = ties, outlines.square_sides, outlines.corner, outlines.pull
+        geometry = ties, outlines.square_sides, outlines.hub, outlines.corner, outlines.pull
         known = outlines.square, *geometry, path, share, cell_side, lost, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen

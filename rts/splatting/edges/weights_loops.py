@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.contracts.records import ON_NEXT, ON_PREVIOUS
+from rts.contracts.records import REACH
 
 
 @loop
@@ -138,19 +138,19 @@ def _add_piece(flux, area, s, pull, i, lone, piece, share_of, first, second):
 
 
 @compiled
-def _hidden(s, square_sides, ties):
-    """The lone break's segment that ends at segment s, see `rts.outlines.segments_loops.meet`; or −1."""
-    found = -1
-    if s + 1 < len(ties) and ties[s + 1, 1] < 0 and square_sides[s + 1, 1] == ON_PREVIOUS:
-        found = s + 1
-    if s > 0 and ties[s - 1, 1] < 0 and square_sides[s - 1, 1] == ON_NEXT:
-        found = s - 1
-    return found
+def _at_hub(s, hub, found):
+    """Fill `found` with the rows of segments that end at another one, or cross it. Returns their number."""
+    count = 0
+    for h in range(max(s - REACH, 0), min(s + REACH + 1, len(hub))):
+        if hub[h] != 0 and h + hub[h] == s:
+            found[count] = h
+            count += 1
+    return count
 
 
 @compiled
 def _weigh_ray(flux, weight, s, i, side, border, ray, rates):
-    """Fill in what a break's outline, from its side of a square to a point where three meet, adds to the cells.
+    """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
 
     Args:
         flux: see `weigh_segments`; filled in for segment s and jump i.
@@ -160,7 +160,7 @@ def _weigh_ray(flux, weight, s, i, side, border, ray, rates):
         side: the side.
         border: see `weigh_segments`.
         ray: (3, 2), the break, a point between, and where the outlines meet.
-        rates: (3, 4), weights of the motions, of the four breaks that pull, at these points.
+        rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
     """
     cuts, sign = np.empty(4), 1.0 if side < 2 else -1.0
     start = _place(ray[0, 0], ray[0, 1], side)
@@ -184,7 +184,7 @@ def _weigh_ray(flux, weight, s, i, side, border, ray, rates):
                 weight[k] += height * dx
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 for r in range(4):
-                    rate = (1 - t) * rates[n, r] + t * rates[n + 1, r]
+                    rate = (1 - t) * rates[n, 0, r] + t * rates[n, 1, r]
                     flux[s, k, i, r, 0] += of_cell * rate * dy
                     flux[s, k, i, r, 1] -= of_cell * rate * dx
 
@@ -200,72 +200,86 @@ def _along(a, b, point):
 
 
 @compiled
-def _fill_rays(s, h, ties, place, gap, square, corner, pull, rays, rates):
-    """Fill rays (3, 3, 2) and rates (3, 3, 4) of `_weigh_ray`: of a segment's start and end, and of the lone break."""
-    for e in range(3):
-        b = ties[s, e] if e < 2 else ties[h, 0]
-        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
-        rays[e, 0, 0], rays[e, 0, 1] = _point(place[b], x, y, gap[b, 2])
-        rays[e, 2] = corner[h]
-        rates[e] = 0.0
-        rates[e, 0, 1 if e != 1 else 2] = 1.0
-    first, near = _along(rays[0, 0], corner[s], corner[h])
-    second, far = _along(rays[1, 0], corner[s], corner[h])
-    t, own = (first, 0) if near <= far else (second, 1)
+def _fill_path(s, place, gap, square, ties, corner, path):
+    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre; see `weigh_segments`."""
     for e in range(2):
-        rays[e, 1], rates[e, 1] = corner[s], pull[s]
-        for r in range(4):
-            rates[e, 2, r] = (1 - t) * rates[own, 0, r] + t * pull[s, r]
-    # The outlines meet on the piece between one end and the corner.
-    rays[own, 1] = (rays[own, 0] + rays[own, 2]) / 2
-    rates[own, 1] = (rates[own, 0] + rates[own, 2]) / 2
-    rays[2, 1] = (rays[2, 0] + rays[2, 2]) / 2
-    rates[2, 1], rates[2, 2] = rates[2, 0], rates[2, 0]
+        b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+        path[2 * e] = _point(place[b], gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0], gap[b, 2])
+    path[1] = corner[s]
+
+
+@compiled
+def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
+    """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
+
+    `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
+    """
+    ray[0], ray[2], rates[:] = path[2 * e], of_hub[1], 0.0
+    rates[0, 0, 1 + e], rates[1, 1] = 1.0, pull[h]
+    if s == h:
+        ray[1], rates[0, 1] = (path[2 * e] + path[1]) / 2, (rates[0, 0] + pull[s]) / 2
+        rates[1, 0] = rates[0, 1]
+        return
+    first, near = _along(of_hub[0], of_hub[1], path[1])
+    second, far = _along(of_hub[2], of_hub[1], path[1])
+    t, own = (first, 0) if near <= far else (second, 3)
+    ray[1], rates[1, 0] = path[1], t * pull[h]
+    rates[1, 0, own] += 1 - t
+    share = _along(path[0], path[2], path[1])[0]
+    rates[0, 1, 1], rates[0, 1, 2] = 1 - share, share
 
 
 @compiled
 def _weigh_meeting(
-    s, h, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, share, cell_side, lost, flux
-):
-    """Fill in the weights of a segment s and of the lone break h that ends at it; see `weigh_segments`.
+    s, others, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, share, cell_side, lost,
+    flux,
+):  # fmt: skip
+    """Fill in the weights of a segment s and of those, rows `others`, that end at it or cross it; see `weigh_segments`.
 
-    Each of three outlines goes from its break to where they meet; between them lie three surfaces.
+    Each of their outlines goes from its break to the segment's corner, and between them lie as many surfaces.
     """
-    rays, rates, weights, at = np.empty((3, 3, 2)), np.empty((3, 3, 4)), np.empty((3, 4)), np.empty(3)
-    owners, jumps = (s, s, h), (0, 1, 0)
-    sides = square_sides[s, 0], square_sides[s, 1], square_sides[h, 0]
-    breaks = ties[s, 0], ties[s, 1], ties[h, 0]
-    _fill_rays(s, h, ties, place, gap, square, corner, pull, rays, rates)
-    for g in (s, h):
-        flux[g], share[g], lost[g], cell_side[g] = 0.0, 0.0, 0.0, -1
-    for e in range(3):
-        _weigh_ray(flux, weights[e], owners[e], jumps[e], sides[e], border, rays[e], rates[e])
-        at[e] = _place(rays[e, 0, 0], rays[e, 0, 1], sides[e])
+    most, count = 2 * (1 + len(others)), 0
+    ray, rates, of_hub, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
+    weights, at, sides = np.empty((most, 4)), np.empty(most), np.empty(most, np.int64)
+    owners, jumps = np.empty(most, np.int64), np.empty(most, np.int64)
+    _fill_path(s, place, gap, square, ties, corner, of_hub)
+    for n in range(most):
+        owner, e = s if n < 2 else others[n // 2 - 1], n % 2
+        if e == 0:
+            flux[owner], share[owner], lost[owner], cell_side[owner] = 0.0, 0.0, 0.0, -1
+        if ties[owner, e] < 0:
+            continue
+        side = square_sides[owner, e]
+        _fill_path(owner, place, gap, square, ties, corner, path)
+        _fill_ray(s, owner, e, of_hub, path, pull, ray, rates)
+        _weigh_ray(flux, weights[count], owner, e, side, border, ray, rates)
+        owners[count], jumps[count], sides[count], at[count] = owner, e, side, _place(ray[0, 0], ray[0, 1], side)
         for k in range(4):
-            share[owners[e], k, jumps[e]] = -weights[e, k] if sides[e] < 2 else weights[e, k]
+            share[owner, k, e] = -weights[count, k] if side < 2 else weights[count, k]
+        count += 1
     for k in range(4):
         # Clockwise, the breaks before and after the corner, between which its surface lies.
         before, after = -1, -1
-        for e in range(3):
+        for e in range(count):
             if before < 0 or (sides[e] < k, at[e], sides[e]) > (sides[before] < k, at[before], sides[before]):
                 before = e
             if after < 0 or (sides[e] < k, at[e], sides[e]) < (sides[after] < k, at[after], sides[after]):
                 after = e
-        one, other = int(sides[before] < 2), int(sides[after] >= 2)
-        b, c = breaks[before], breaks[after]
+        one, other, i, j = int(sides[before] < 2), int(sides[after] >= 2), jumps[before], jumps[after]
+        b, c = ties[owners[before], i], ties[owners[after], j]
         next_b = _next_side(sides[before], k, near_ends[b, 0], near_ends[b, 1])
         next_c = _next_side(sides[after], k, near_ends[c, 0], near_ends[c, 1])
         known = (next_b == one or next_c == other) and next_b != 1 - one and next_c != 1 - other
         if known and seen[b, one] and seen[c, other]:
-            cell_side[owners[before], k, jumps[before]], cell_side[owners[after], k, jumps[after]] = one, other
+            cell_side[owners[before], k, i], cell_side[owners[after], k, j] = one, other
             own = max(weights[after, k] - weights[before, k], 0.0) / 2
-            lost[owners[before], k, jumps[before]] = lost[owners[after], k, jumps[after]] = own
+            lost[owners[before], k, i] = lost[owners[after], k, j] = own
 
 
 @loop
 def weigh_segments(
-    first, last, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, path, share, cell_side,
-    lost, flux,
+    first, last, border, place, gap, near_ends, seen, square, ties, square_sides, hub, corner, pull, path, share,
+    cell_side, lost, flux,
 ):  # fmt: skip
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
@@ -280,6 +294,7 @@ def weigh_segments(
         square: (S, 2).
         ties: (S, 2).
         square_sides: (S, 2).
+        hub: (S,).
         corner: (S, 2).
         pull: (S, 4).
         path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
@@ -290,36 +305,29 @@ def weigh_segments(
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
             that pull.
     """
-    cuts, area = np.empty(4), np.empty(4)
+    cuts, area, rows = np.empty(4), np.empty(4), np.empty(2 * REACH, np.int64)
     for s in range(first, last):
         if ties[s, 0] == ties[s, 1]:
             path[s], share[s], cell_side[s], lost[s], flux[s] = 0.0, 0.0, -1, 0.0, 0.0
             continue
-        lone, hidden = ties[s, 1] < 0, _hidden(s, square_sides, ties)
-        if lone and square_sides[s, 1] >= 0:
-            path[s] = 0.0
-            continue  # Its weights are filled in with those of the segment that it ends at.
+        lone = ties[s, 1] < 0
+        _fill_path(s, place, gap, square, ties, corner, path[s])
+        if hub[s] != 0:
+            continue  # Its weights are filled in with those of that segment.
+        count = _at_hub(s, hub, rows)
+        if count > 0:
+            of_breaks = place, gap, near_ends, seen
+            of_segments = square, ties, square_sides, corner, pull, share, cell_side, lost, flux
+            _weigh_meeting(s, rows[:count], border, *of_breaks, *of_segments)
+            continue
         flux[s] = 0.0
         side0 = square_sides[s, 0]
         side1 = (side0 + 2) % 4 if lone else square_sides[s, 1]
-        b = ties[s, 0]
-        start_x, start_y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
-        path[s, 0, 0], path[s, 0, 1] = _point(place[b], start_x, start_y, gap[b, 2])
         if lone:
             along = gap[ties[s, 0], 2]
             path[s, 2, 0] = path[s, 0, 0] if along == 1 else 1 - path[s, 0, 0]
             path[s, 2, 1] = 1 - path[s, 0, 1] if along == 1 else path[s, 0, 1]
-        else:
-            b = ties[s, 1]
-            start_x, start_y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
-            path[s, 2, 0], path[s, 2, 1] = _point(place[b], start_x, start_y, gap[b, 2])
-        for a in range(2):
-            path[s, 1, a] = (path[s, 0, a] + path[s, 2, a]) / 2 if lone else corner[s, a]
-        if hidden >= 0:
-            of_breaks = place, gap, near_ends, seen
-            of_segments = square, ties, square_sides, corner, pull, share, cell_side, lost, flux
-            _weigh_meeting(s, hidden, border, *of_breaks, *of_segments)
-            continue
+            path[s, 1] = (path[s, 0] + path[s, 2]) / 2
         # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
         sign0 = 1.0 if side0 < 2 else -1.0
         sign1 = sign0 if lone else (1.0 if side1 >= 2 else -1.0)
