@@ -72,26 +72,20 @@ def _change(rgba, behind, k, light, before, after, c):
     return 0.5 * light * ((rgba[after, c] - rgba[before, c]) - opacity * behind[k, c])
 
 
-@compiled
-def _laid(rgba, n, light, out, y, x):
-    """Add a layer, if there is one, behind those of a cell in `out` (2, H, W, C); returns the light that passes."""
-    if n < 0 or light <= 0:
-        return light
-    for c in range(rgba.shape[1]):
-        out[0, y, x, c] += light * rgba[n, c]
-    return light * (1 - rgba[n, rgba.shape[1] - 1])
-
-
 @loop
 def cells(first, last, rgba, row, out):
     """Fill lines `first` to `last` of `out` (2, H, W, C): composites, and zeros."""
+    alpha = rgba.shape[1] - 1
+    out[:, first:last] = 0.0
     for y in range(first, last):
         for x in range(row.shape[2]):
-            for c in range(rgba.shape[1]):
-                out[0, y, x, c] = out[1, y, x, c] = 0.0
             light = 1.0
             for k in range(len(row)):
-                light = _laid(rgba, row[k, y, x], light, out, y, x)
+                n = row[k, y, x]
+                if n >= 0 and light > 0:
+                    for c in range(alpha + 1):
+                        out[0, y, x, c] += light * rgba[np.uint32(n), c]
+                    light *= 1 - rgba[np.uint32(n), alpha]
 
 
 @loop
@@ -120,6 +114,15 @@ def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
                     out[1, y, x, c] -= aside + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
 
 
+@compiled
+def _dot(rgba, n, g, half, y, x):
+    """The product of a sample's colour and one half of the gradient (2, H, W, C) of a cell."""
+    total = 0.0
+    for c in range(rgba.shape[1]):
+        total += rgba[n, c] * g[half, y, x, c]
+    return total
+
+
 @loop
 def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `g` (2, H, W, C); empty ones are not wanted.
@@ -127,31 +130,28 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     The second half is what moves along the slopes of composites, which has a derivative alone.
     """
     most, height, width = row.shape
-    count = rgba.shape[1]
-    samples, layers, through, behind = _rooms(most, count)
+    count, alpha = rgba.shape[1], rgba.shape[1] - 1
+    samples, layers, through = np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most)
     for y in range(height):
         for x in range(width):
-            reached = _weigh(rgba, row, y, x, samples, layers, through)
-            if reached == 0:
-                continue
-            _stack(rgba, samples, reached, behind)
-            for k in range(reached if len(g_rgba) else 0):
-                n, hidden = samples[k], 0.0
-                for c in range(count):
-                    g_rgba[n, c] += through[k] * g[0, y, x, c]
-                    hidden += behind[k, c] * g[0, y, x, c]
-                g_rgba[n, count - 1] -= through[k] * hidden
-            for k in range(reached if len(g_positions) else 0):
-                left, right = _beside(row, joined, layers[k], y, x, 0)
-                up, down = _beside(row, joined, layers[k], y, x, 1)
-                if left == right and up == down:
-                    continue
-                n, across, along = samples[k], 0.0, 0.0
-                for c in range(count):
-                    across += _change(rgba, behind, k, through[k], left, right, c) * g[1, y, x, c]
-                    along += _change(rgba, behind, k, through[k], up, down, c) * g[1, y, x, c]
-                g_positions[n, 0] -= across
-                g_positions[n, 1] -= along
+            # What is behind a layer, times the gradient: all that is asked of it.
+            behind, moved_behind = 0.0, 0.0
+            for k in range(_weigh(rgba, row, y, x, samples, layers, through) - 1, -1, -1):
+                n, light = samples[k], through[k]
+                passed = 1 - rgba[n, alpha]
+                if len(g_rgba):
+                    for c in range(count):
+                        g_rgba[n, c] += light * g[0, y, x, c]
+                    g_rgba[n, alpha] -= light * behind
+                    behind = _dot(rgba, n, g, 0, y, x) + passed * behind
+                if len(g_positions):
+                    for axis in range(2):
+                        before, after = _beside(row, joined, layers[k], y, x, axis)
+                        if before != after:
+                            change = _dot(rgba, after, g, 1, y, x) - _dot(rgba, before, g, 1, y, x)
+                            change -= (rgba[after, alpha] - rgba[before, alpha]) * moved_behind
+                            g_positions[n, axis] -= 0.5 * light * change
+                    moved_behind = _dot(rgba, n, g, 1, y, x) + passed * moved_behind
 
 
 # ---------------------------------------------------------------------------------------------------- beside breaks
