@@ -300,7 +300,8 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
     at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
     curve is two thirds as far from the chord as their meeting. At a tip, which comes back to the side
-    of the square that it entered by, the tangents are the edges of the triangles there.
+    of the square that it entered by, the tangents are the edges of the triangles there. An outline that ends alone in
+    a square does so half across.
 
     Args:
         first: the first segment.
@@ -318,6 +319,9 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
     for s in range(first, last):
         start, end = _row(place, ties[s, 0]), _row(place, ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0])
         x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
+        if ties[s, 1] < 0:  # Straight into the square, as far as its middle.
+            side = square_sides[s, 0]
+            x, y = x + (0.0, -0.5, 0.0, 0.5)[side], y + (0.5, 0.0, -0.5, 0.0)[side]
         alone, on, back = 0.0, 0.0, 0.0
         tip = ties[s, 1] >= 0 and square_sides[s, 0] == square_sides[s, 1]
         if tip:

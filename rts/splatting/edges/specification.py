@@ -30,6 +30,7 @@ from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.contracts.records import REACH, Outlines
 from rts.splatting.cells import centres, unpack
+from rts.splatting.edges.gap_places import normals
 from rts.splatting.edges.weights import BORDER
 
 STEPS = tuple(step for step in range(-REACH, REACH + 1) if step)
@@ -50,12 +51,7 @@ def specification(positions: Array, rgba: Array, row: Array, *arrays: Array, bor
     if outlines.place.shape[0] == 0:
         return without_border(image, border)
     breaks = _Breaks.of(outlines, positions, rgba)
-    segments = _Segments.of(outlines, breaks)
-    parts = [
-        *_beside_breaks(breaks, segments, outlines, color, motion),
-        *segments.parts(color),
-        *segments.meetings(color),
-    ]
+    parts = [*_beside_breaks(breaks, outlines, color, motion), *_Rays.of(outlines, breaks).parts(color)]
     cells = xp.concat([y * width + x for x, y, _ in parts])
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
@@ -148,293 +144,181 @@ class _Breaks(NamedTuple):
         return cls(first + outlines.place[:, None] * step, step, color, seen, xp.stack(motion), moves)
 
 
-class _Segments(NamedTuple):
-    """Segments, each from a break to another; or from a lone break straight across its square, of which half counts.
+class _Rays(NamedTuple):
+    """Outlines from breaks on the sides of squares to points inside, where they meet: R = 2 S, of all starts and ends.
 
-    Segments may also end at another one, behind its surface, or cross it.
+    A ray leads to the corner of its segment, or of the one that this ends at or crosses. The outline of a lone break
+    ends alone.
 
     Attributes:
-        square: (S, 2) int, x and y of the first corner's cell.
-        lone: (S,) bool.
-        path: (3, S, 2), x and y of start, corner and end, from the first corner's centre.
-        square_sides: (S, 2) int, the sides of the square that start and end lie on.
-        ties: (S, 2) int, the breaks at start and end.
-        jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
-        right: (2, S, C), the colour on the right.
-        before: (2, S) bool, at start and end, is what lies before the break on the right of the way?
-        next: (4, 2, S) int, the side of the breaks, 0 or 1, that a corner of the square is next to, or −1.
-        seen: (2, S, 2) bool, is there a sample on these sides?
-        moves: (3, S, 2), the motion of start, corner and end.
-        beyond: (2, S, 2), the motions of the breaks in `Outlines.beyond`.
-        number: (S,) int, the segments' own rows.
-        hub: (S,) int, the row of the segment that each ends at, or crosses, in its corner; or −1.
-        meets: (S,) bool, do others end at the segment, or cross it?
+        square: (R, 2) int, x and y of the first corner's cell.
+        counts: (R,) bool, is there such a ray?
+        group: (G, S) int, the rays that meet at the corner of each segment, and (G, S) bool, are there these?
+        leader: (R,) int, the segment at whose corner the ray ends.
+        side: (R,) int, the side of the square.
+        place: (R,) the place of the break on the sides, clockwise from the upper left corner: 0 to 4.
+        points: (3, R, 2), the break, a point between and the end, from the first corner's centre.
+        moves: the motions (R, 2) of both ends of both pieces.
+        jumps: the colours (R, C) on the right of the way less those on the left, at the break and at the end.
+        before: (R, C), the colours before the breaks, clockwise.
+        after: (R, C), those after.
+        next: (4, R) int, the side of the breaks, 0 or 1, that a corner of the square is next to, or −1.
+        seen: (R, 2) bool, is there a sample on these sides?
     """
 
     square: Array
-    lone: Array
-    path: Array
-    square_sides: Array
-    ties: Array
-    jump: Array
-    right: Array
+    counts: Array
+    group: tuple[Array, Array]
+    leader: Array
+    side: Array
+    place: Array
+    points: Array
+    moves: Sequence[Sequence[Array]]
+    jumps: tuple[Array, Array]
     before: Array
+    after: Array
     next: Array
     seen: Array
-    moves: Array
-    beyond: Array
-    number: Array
-    hub: Array
-    meets: Array
 
     @classmethod
-    def of(cls, outlines: Outlines, breaks: _Breaks) -> _Segments:
-        """The segments between breaks."""
-        xp, side = namespace(breaks.place), outlines.square_sides
-        lone, first = outlines.ties[:, 1] < 0, outlines.ties[:, 0]
-        number = xp.astype(engine_of(side).arange(side.shape[0], outlines.corner), side.dtype)
-        hub = xp.where(outlines.hub != 0, number + outlines.hub, -1)
-        meets = xp.zeros_like(lone)
-        for step in STEPS:
-            meets = meets | (xp.roll(hub, -step, axis=0) == number)
-        ties = xp.stack([first, xp.where(lone, first, outlines.ties[:, 1])], axis=-1)
-        side = xp.stack([side[:, 0], xp.where(lone, (side[:, 0] + 2) % 4, side[:, 1])], axis=-1)
+    def of(cls, outlines: Outlines, breaks: _Breaks) -> _Rays:
+        """The rays of segments between breaks."""
+        xp, lone, sides = namespace(breaks.place), outlines.ties[:, 1] < 0, outlines.square_sides
+        ties = xp.concat([outlines.ties[:, 0], xp.where(lone, outlines.ties[:, 0], outlines.ties[:, 1])])
+        side = xp.concat([sides[:, 0], xp.where(lone, sides[:, 0], sides[:, 1])])
         square = xp.stack([outlines.square[:, 1], outlines.square[:, 0]], axis=-1)
-        origin = xp.astype(square, breaks.place.dtype) + 0.5
-        start, end = (xp.take(breaks.place, ties[:, i], axis=0) - origin for i in (0, 1))
-        along = xp.take(breaks.step, ties[:, 0], axis=0)
-        end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
-        start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
-        corner = xp.where((lone & (hub < 0))[:, None], (start + end) / 2, outlines.corner)
-        jump, right, turned, moves = [], [], [], []
-        for i in (0, 1):
-            before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
-            # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
-            forward = (side[:, i] < 2) if i == 0 else (side[:, i] >= 2)
-            jump.append(xp.where(forward[:, None], before - behind, behind - before))
-            right.append(xp.where(forward[:, None], before, behind))
-            turned.append(forward)
-            moves.append(xp.take(breaks.moves, ties[:, i], axis=0))
-        jump[1], right[1] = (xp.where(lone[:, None], x[0], x[1]) for x in (jump, right))
-        turned[1] = xp.where(lone, turned[0], turned[1])
-        beside = xp.stack([_next(k, ties, side, lone, outlines.ends) for k in range(4)])
-        seen = xp.stack([xp.stack([xp.take(breaks.seen[k], ties[:, i]) for k in (0, 1)], axis=-1) for i in (0, 1)])
-        beyond = [
-            xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0)
-            for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
-        ]
-        pulled = (beyond[0], *moves, beyond[1])
-        moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
-        path = xp.stack([start, corner, end])
-        sides = xp.stack(jump), xp.stack(right), xp.stack(turned), beside, seen
-        return cls(square, lone, path, side, ties, *sides, xp.stack(moves), xp.stack(beyond), number, hub, meets)
+        twice = xp.concat([square, square])
+        start = xp.clip(xp.take(breaks.place, ties, axis=0) - xp.astype(twice, breaks.place.dtype) - 0.5, 0.0, 1.0)
+        x, y = start[:, 0], start[:, 1]
+        place = xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y)))
+        before, behind = (xp.take(color, ties, axis=0) for color in (breaks.color[0], breaks.color[1]))
+        forward = (side < 2)[:, None]  # Clockwise, sides 0 and 1 lead along their gaps.
+        before, after = xp.where(forward, before, behind), xp.where(forward, behind, before)
+        firsts, lasts = (xp.take(outlines.ends[:, i], ties) for i in (0, 1))
+        seen = xp.stack([xp.take(breaks.seen[k], ties) for k in (0, 1)], axis=-1)
+        same = (outlines.ties[:, 0] == outlines.ties[:, 1]) & ~lone
+        group, alone, hub = _grouped(outlines, ~same, ~same & ~lone)
+        points, moves = _ways(outlines, breaks, ties, start, hub)
+        # The two jumps of a segment at which no other ends go over into one another.
+        jump, (count, half) = before - after, (lone.shape[0], (alone & ~lone)[:, None])
+        mean = (jump[:count, ...] - jump[count:, ...]) / 2
+        ends = [xp.where(half, x, y) for x, y in ((mean, jump[:count, ...]), (-mean, jump[count:, ...]))]
+        return cls(
+            twice,
+            xp.concat([~same, ~same & ~lone]),
+            group,
+            xp.concat([hub, hub]),
+            side,
+            place,
+            points,
+            moves,
+            (jump, xp.concat(ends)),
+            before,
+            after,
+            xp.stack([_next(k, side, firsts, lasts) for k in range(4)]),
+            seen,
+        )
 
     def parts(self, color: Array) -> list[tuple[Array, Array, Array]]:
-        """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
+        """Changes that outlines make: cells (x and y) and changes, for each corner of the squares.
 
-        Beside a segment the cell gets the other side's colour, and loses its own: that of the segment's side, or that
-        of the cell's centre, `color` (H, W, C), where this shows the same surface.
-
-        The area of a quarter of the square on the right of the way is minus the integral of y over x around it: along
-        the way, in straight pieces, and back along the square's sides, of which only the bottom counts.
+        Clockwise around a square, the colour rises by a jump at each break; what is on the way from there to the ray's
+        end counts against it. Between the breaks before and after the corner lies the surface that is seen at the
+        cell's centre: what is lost of it has the colour there, of `color` (H, W, C).
         """
-        xp, mean, parts = namespace(self.path), (self.jump[0] + self.jump[1]) / 2, []
-        flat = xp.reshape(color, (-1, color.shape[2]))
-        pieces, bottoms = self._pieces(), [self._right_of_bottom(2.5, 3.0), self._right_of_bottom(2.0, 2.5)]
-        for k, (dx, dy) in enumerate(CORNERS):
-            area, change = 0.5 * bottoms[dx], xp.zeros_like(mean)
-            for at, way, flux in pieces:
-                column = at[:, 0] >= 0.5 if dx else at[:, 0] < 0.5
-                height = xp.clip(at[:, 1] - 0.5 * dy, 0.0, 0.5)
-                area = area - xp.where(column, height * way[:, 0], 0.0)
-                right, below = (xp.clip((at[:, a] - 0.5) / BORDER + 0.5, 0.0, 1.0) for a in (0, 1))
-                share = (right if dx else 1 - right) * (below if dy else 1 - below)
-                change = change + share[:, None] * flux
-            on_right, x, y = self._on_the_right(k), self.square[:, 0] + dx, self.square[:, 1] + dy
-            share = xp.where(on_right, area - 0.25, area)
-            beside = (self.square_sides[:, 0] == k) | (self.square_sides[:, 0] == (k + 3) % 4)
-            share = xp.where(self.lone & ~beside, 0.0, share)[:, None]
-            beside = xp.where(on_right[:, None], self.right, self.right - self.jump)
-            centre = xp.take(flat, y * color.shape[1] + x, axis=0)
-            differs = xp.where(self._knows(k, on_right)[:, None], centre - (beside[0] + beside[1]) / 2, 0.0)
-            change = change + share * mean - xp.abs(share) * differs
-            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone | (self.hub >= 0) | self.meets
-            parts.append((x, y, xp.where(nothing[:, None], 0.0, change)))
-        return parts
+        xp, parts, (near, there) = namespace(self.points), [], self.group
+        flat, count = xp.reshape(color, (-1, color.shape[2])), near.shape[1]
 
-    def meetings(self, color: Array) -> list[tuple[Array, Array, Array]]:
-        """Changes as of `parts`, of segments at which others end, or which others cross, and of these.
+        def of_group(x: Array) -> Array:
+            return xp.reshape(xp.take(x, xp.reshape(near, (-1,))), near.shape)
 
-        All these outlines go from their breaks to the segment's corner, and as many surfaces lie between them.
-        Clockwise around the square, the colour rises by a jump at each break; what is on the way from there to the
-        corner counts against it.
-        """
-        xp, parts, rays = namespace(self.path), [], self._rays()
-        flat, count = xp.reshape(color, (-1, color.shape[2])), self.number.shape[0]
-        counts = [self.meets | (self.hub >= 0), self.meets | (self.hub >= 0) & ~self.lone]
-        side, place = (xp.concat([getattr(ray, name) for ray in rays]) for name in ("side", "place"))
-        before, after = (xp.concat([getattr(ray, name) for ray in rays]) for name in ("before", "after"))
-        seen = xp.concat([self.seen[0], self.seen[1]])
-        # Both rays of each segment, and of those beside it in the list, of which some end at it or cross it.
-        near, there = [self.number, count + self.number], [self.meets, self.meets]
-        for step in STEPS:
-            row = xp.clip(self.number + step, 0, count - 1)
-            here = (xp.take(self.hub, row) == self.number) & (row == self.number + step)
-            near, there = [*near, row, count + row], [*there, here, here & ~xp.take(self.lone, row)]
-        near, there = xp.stack(near), xp.stack(there)
+        number = xp.sum(xp.astype(there, self.place.dtype), axis=0)
+        columns = xp.astype(engine_of(near).arange(count, self.place), near.dtype)
         for k, (dx, dy) in enumerate(CORNERS):
             x, y = self.square[:, 0] + dx, self.square[:, 1] + dy
-            weights, fluxes = zip(*(ray.onto(k) for ray in rays), strict=True)
-            changes = [f - w[:, None] * ray.jump for w, f, ray in zip(weights, fluxes, rays, strict=True)]
-            change = sum(xp.where(c[:, None], x, 0.0) for c, x in zip(counts, changes, strict=True))
-            weight, next_ = xp.concat(list(weights)), xp.concat([self.next[k, 0], self.next[k, 1]])
+            weight, flux = self._onto(k)
+            # Jumps around a point add up to 0; those of colours that change along outlines hardly miss it.
+            mean = xp.sum(xp.where(there, of_group(weight), 0.0), axis=0) / xp.where(number > 0, number, 1.0)
+            share = weight - xp.take(mean, self.leader)
+            parts.append((x, y, xp.where(self.counts[:, None], flux - share[:, None] * self.jumps[0], 0.0)))
             # Sides break ties of places in corners, which two of them share.
-            keys = xp.where(side < k, 8.0, 0.0) + place + 1e-5 * xp.astype(side, place.dtype)
-            keys = xp.reshape(xp.take(keys, xp.reshape(near, (-1,))), near.shape)
-            known, fails, around = xp.zeros_like(self.meets), xp.zeros_like(self.meets), []
+            keys = xp.where(self.side < k, 8.0, 0.0) + self.place + 1e-5 * xp.astype(self.side, self.place.dtype)
+            keys, known, fails, around = of_group(keys), False, False, []
             for clockwise, beyond in ((True, xp.where(there, keys, -1.0)), (False, -xp.where(there, keys, 99.0))):
-                best = xp.astype(xp.argmax(beyond, axis=0), self.number.dtype) * count + self.number
+                best = xp.astype(xp.argmax(beyond, axis=0), near.dtype) * count + columns
                 ray = xp.take(xp.reshape(near, (-1,)), best)
-                expected = xp.where((xp.take(side, ray) < 2) == clockwise, 1, 0)
-                found, sees = xp.take(next_, ray), xp.take(seen, ray, axis=0)
+                expected = xp.where((xp.take(self.side, ray) < 2) == clockwise, 1, 0)
+                found, sees = xp.take(self.next[k, :], ray), xp.take(self.seen, ray, axis=0)
                 known = known | (found == expected)
                 fails = fails | (found == 1 - expected) | ~xp.where(expected == 0, sees[:, 0], sees[:, 1])
                 around.append(ray)
-            beside = (xp.take(after, around[0], axis=0) + xp.take(before, around[1], axis=0)) / 2
-            centre = xp.take(flat, y * color.shape[1] + x, axis=0)
-            lost = xp.clip(xp.take(weight, around[1]) - xp.take(weight, around[0]), 0.0, None)
-            own = xp.where(self.meets & known & ~fails, lost, 0.0)[:, None] * (centre - beside)
-            parts.append((x, y, change - own))
+            first, last = around
+            beside = (xp.take(self.after, first, axis=0) + xp.take(self.before, last, axis=0)) / 2
+            x, y = x[:count], y[:count]
+            lost = xp.clip(xp.take(weight, last) - xp.take(weight, first), 0.0, None)
+            lost = xp.where((number > 0) & known & ~fails, lost, 0.0)[:, None]
+            parts.append((x, y, lost * (beside - xp.take(flat, y * color.shape[1] + x, axis=0))))
         return parts
 
-    def _rays(self) -> list[_Ray]:
-        """The outlines from start and end of each segment to its corner, or to that of the one it ends at or crosses.
-
-        They run along that one from where they meet it, and move there as that does.
-        """
-        xp, places, alone = namespace(self.path), self._places(), (self.hub < 0)[:, None]
-        hub = xp.take(self.path, xp.where(self.hub >= 0, self.hub, self.number), axis=1)
-        at, until, rays = self.path[1], self.moves[1], []
-        (first, near), (second, far) = (_along(hub[i], hub[1], at) for i in (0, 2))
-        starts = near <= far
-        t, own = xp.where(starts, first, second)[:, None], xp.where(starts[:, None], *self.beyond)
-        share = _along(self.path[0], self.path[2], at)[0][:, None]
-        share = xp.where(self.lone[:, None], 0.0, share)
-        there = (1 - share) * self.moves[0] + share * self.moves[2]
-        for e in (0, 1):
-            start, move = self.path[2 * e], self.moves[2 * e]
-            points = xp.stack([start, xp.where(alone, (start + at) / 2, at), hub[1]])
-            middle = (move + until) / 2
-            onto, along = xp.where(alone, middle, there), xp.where(alone, middle, (1 - t) * own + t * until)
-            jump, left = (self.jump[0] if e == 0 else -self.jump[1]), self.right[e] - self.jump[e]
-            after, before = (left, self.right[e]) if e == 0 else (self.right[e], left)
-            moves = (move, onto), (along, until)
-            rays.append(_Ray(points, moves, jump, self.square_sides[:, e], places[e], before, after))
-        return rays
-
-    def _knows(self, k: int, on_right: Array) -> Array:
-        """(S,) True where the segment's side towards a corner is the surface that is seen at this corner."""
-        xp, found, fails = namespace(self.path), False, False
-        for e in (0, 1):
-            side = xp.where(self.before[e] == on_right, 0, 1)
-            found = found | (self.next[k, e] == side)
-            fails = fails | (self.next[k, e] == 1 - side) | ~xp.where(side == 0, self.seen[e, :, 0], self.seen[e, :, 1])
-        return found & ~fails
-
-    def normals(self, breaks: _Breaks) -> Array:
-        """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
-        xp, way = namespace(self.path), self.path[2] - self.path[0]
-        engine, count, same = engine_of(self.path), breaks.place.shape[0], self.ties[:, 0] == self.ties[:, 1]
-        normal, total = xp.stack([way[:, 1], -way[:, 0]], axis=-1), breaks.step * 1e-6
-        for i in (0, 1):
-            # Two segments at a line of crossing may run in opposite directions.
-            ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
-            turned = xp.where(same[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
-            total = total + engine.segment_sum(turned, self.ties[:, i], count)
-        return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
-
-    def _places(self) -> list[Array]:
-        """Places (S,) of start and end on the square's sides, clockwise from the upper left corner: 0 to 4."""
-        xp, places = namespace(self.path), []
-        for i in (0, 1):
-            x, y, side = self.path[2 * i][:, 0], self.path[2 * i][:, 1], self.square_sides[:, i]
-            places.append(xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y))))
-        return places
-
-    def _on_the_right(self, k: int) -> Array:
-        """(S,) True where a corner lies on the right of the way: clockwise between the end and the start."""
-        # Clockwise, corner k begins side k, so all that lies on sides from k on comes after it.
-        start, end = self.square_sides[:, 0] >= k, self.square_sides[:, 1] >= k
-        return namespace(start).where(self._clockwise(), start | ~end, start & ~end)
-
-    def _clockwise(self) -> Array:
-        """(S,) True where the end comes after the start on the square's sides; these meet in corners."""
-        (start, end), sides = self._places(), self.square_sides
-        return (start < end) | ((start == end) & (sides[:, 0] < sides[:, 1]))
-
-    def _right_of_bottom(self, low: float, high: float) -> Array:
-        """(S,) the length, between two places on the square's sides, of what lies on the right of the way."""
-        (start, end), xp = self._places(), namespace(self.path)
-
-        def between(a: Array, b: Array) -> Array:
-            return xp.clip(xp.clip(b, low, high) - xp.clip(a, low, high), 0.0, None)
-
-        return xp.where(self._clockwise(), high - low - between(start, end), between(end, start))
-
-    def _pieces(self) -> list[tuple[Array, Array, Array]]:
-        """Middles (S, 2), ways (S, 2) and fluxes (S, C) of straight pieces of segments, cut where pixels meet."""
-        xp, pieces, jump = namespace(self.path), [], stopped(self.jump)
-        chord = self.path[2] - self.path[0]
-        length = xp.sum(chord * chord, axis=-1)
-        turn = xp.sum((self.path[1] - self.path[0]) * chord, axis=-1) / xp.where(length > 0, length, 1.0)
-        shares = xp.zeros_like(turn), turn, xp.ones_like(turn)
-        for at, way, moves, (i, t) in _cut(self.path, (self.moves[:2], self.moves[1:])):
-            u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
-            flux = moves[:, 0] * way[:, 1] - moves[:, 1] * way[:, 0]
-            # A lone break's edge ends amid the square.
-            beside = xp.sum(xp.abs(at - self.path[0]), axis=-1) <= 0.5
-            flux = xp.where(self.lone & ~beside, 0.0, flux)
-            pieces.append((at, way, flux[:, None] * ((1 - u) * jump[0] + u * jump[1])))
-        return pieces
-
-
-class _Ray(NamedTuple):
-    """Outlines from breaks on sides of squares to points inside where they meet others.
-
-    Attributes:
-        points: (3, S, 2), the break, a point between, and the end.
-        moves: the motions (S, 2) of both ends of both pieces.
-        jump: (S, C), the colour on the right of the way less that on the left.
-        side: (S,) the side of the square.
-        place: (S,) the place of the break on the sides, clockwise.
-        before: (S, C), the colour before it, clockwise.
-        after: (S, C), the colour after it.
-    """
-
-    points: Array
-    moves: Sequence[Sequence[Array]]
-    jump: Array
-    side: Array
-    place: Array
-    before: Array
-    after: Array
-
-    def onto(self, k: int) -> tuple[Array, Array]:
-        """By how much the colour of the quarter at corner k rises with the jump, clockwise (S,); the flux (S, C)."""
-        xp, (dx, dy), jump = namespace(self.points), CORNERS[k], stopped(self.jump)
-        low, place = 2.0 if dx else 2.5, self.place
+    def _onto(self, k: int) -> tuple[Array, Array]:
+        """By how much the colour of the quarter at corner k rises with the jump, clockwise (R,); the flux (R, C)."""
+        xp, (dx, dy), place = namespace(self.points), CORNERS[k], self.place
+        low, (first, last) = 2.0 if dx else 2.5, (stopped(jump) for jump in self.jumps)
         weight = 0.5 * xp.clip(low + 0.5 - xp.clip(place, low, None), 0.0, None)
-        weight = weight - 0.25 * xp.astype(self.side < k, place.dtype)
-        flux = xp.zeros_like(jump)
-        for at, way, moves, _ in _cut(self.points, self.moves):
+        weight, flux = weight - 0.25 * xp.astype(self.side < k, place.dtype), xp.zeros_like(first)
+        for at, way, moves, (i, t) in _cut(self.points, self.moves):
             column = at[:, 0] >= 0.5 if dx else at[:, 0] < 0.5
             height = xp.clip(at[:, 1] - 0.5 * dy, 0.0, 0.5)
             weight = weight + xp.where(column, height * way[:, 0], 0.0)
             right, below = (xp.clip((at[:, a] - 0.5) / BORDER + 0.5, 0.0, 1.0) for a in (0, 1))
             share = (right if dx else 1 - right) * (below if dy else 1 - below)
             rate = moves[:, 0] * way[:, 1] - moves[:, 1] * way[:, 0]
-            flux = flux + (share * rate)[:, None] * jump
+            t = t if i == 0 else xp.ones_like(t)
+            flux = flux + (share * rate)[:, None] * ((1 - t) * first + t * last)
         return weight, flux
+
+
+def _grouped(outlines: Outlines, start: Array, end: Array) -> tuple[tuple[Array, Array], Array, Array]:
+    """`_Rays.group`, is each segment alone in it (S,), and the segment (S,) at whose corner each one's rays end.
+
+    `start` and `end` (S,) tell which rays there are.
+    """
+    xp, steps, count = namespace(start), outlines.hub, outlines.hub.shape[0]
+    number = xp.astype(engine_of(steps).arange(count, outlines.corner), steps.dtype)
+    leads = steps == 0
+    near, there, alone = [number, count + number], [start & leads, end & leads], leads
+    # Beside each segment in the list there are those which end at it or cross it.
+    for step in STEPS:
+        row = xp.clip(number + step, 0, count - 1)
+        here = (row == number + step) & (xp.take(steps, row) == -step)
+        near, there = [*near, row, count + row], [*there, here, here & xp.take(end, row)]
+        alone = alone & ~here
+    return (xp.stack(near), xp.stack(there)), alone, number + steps
+
+
+def _ways(
+    outlines: Outlines, breaks: _Breaks, ties: Array, start: Array, hub: Array
+) -> tuple[Array, Sequence[Sequence[Array]]]:
+    """`_Rays.points` and `_Rays.moves`, given the breaks and points (R, ...) where rays start, and their `leader` (S,).
+
+    A ray runs along the segment that its own one ends at, from where it meets that, and moves there as that does.
+    """
+    xp, count, alone = namespace(start), hub.shape[0], (outlines.hub == 0)[:, None]
+    corner, own = outlines.corner, [xp.take(breaks.moves, x, axis=0) for x in (ties[:count], ties[count:])]
+    beyond = [
+        xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0) for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
+    ]
+    at_corner = sum(outlines.pull[:, i, None] * x for i, x in enumerate((beyond[0], own[0], own[1], beyond[1])))
+    path = [start[:count, ...], corner, start[count:, ...]]
+    others = [xp.take(x, hub, axis=0) for x in path]
+    (first, near), (second, far) = (_along(others[i], others[1], corner) for i in (0, 2))
+    t, along = xp.where(near <= far, first, second)[:, None], xp.where((near <= far)[:, None], *beyond)
+    share = _along(path[0], path[2], corner)[0][:, None]
+    there = xp.where(alone, at_corner, (1 - share) * own[0] + share * own[1])
+    along = xp.where(alone, at_corner, (1 - t) * along + t * at_corner)
+    points = xp.stack([start, *(xp.concat([x, x]) for x in (corner, others[1]))])
+    there, along, last = (xp.concat([x, x]) for x in (there, along, at_corner))
+    return points, ((xp.concat(own), there), (along, last))
 
 
 def _cut(
@@ -470,14 +354,11 @@ def _along(start: Array, end: Array, point: Array) -> tuple[Array, Array]:
     return t, xp.sum(off * off, axis=-1)
 
 
-def _next(k: int, ties: Array, side: Array, lone: Array, ends: Array) -> Array:
-    """`_Segments.next` of the corner k."""
-    xp, found = namespace(ties), []
-    for e in (0, 1):
-        first, last = (xp.take(ends[:, i], ties[:, e]) for i in (0, 1))
-        begins, stops = ((side[:, e] == a) | (side[:, e] == b) for a, b in FIRST_AND_LAST[k])
-        found.append(xp.where(begins & first, 0, xp.where(stops & last, 1, -1)))
-    return xp.stack([found[0], xp.where(lone, -1, found[1])])
+def _next(k: int, side: Array, firsts: Array, lasts: Array) -> Array:
+    """`_Rays.next` of the corner k, for breaks that are the first or last of their gaps."""
+    begins, stops = ((side == a) | (side == b) for a, b in FIRST_AND_LAST[k])
+    xp = namespace(side)
+    return xp.where(begins & firsts, 0, xp.where(stops & lasts, 1, -1))
 
 
 FIRST_AND_LAST = (((0, 3), (9, 9)), ((1, 9), (0, 9)), ((9, 9), (1, 2)), ((2, 9), (3, 9)))
@@ -485,7 +366,7 @@ FIRST_AND_LAST = (((0, 3), (9, 9)), ((1, 9), (0, 9)), ((9, 9), (1, 2)), ((2, 9),
 
 
 def _beside_breaks(
-    breaks: _Breaks, segments: _Segments, outlines: Outlines, color: Array, motion: Array
+    breaks: _Breaks, outlines: Outlines, color: Array, motion: Array
 ) -> list[tuple[Array, Array, Array]]:
     """Changes in the two cells of each gap: on each surface the colour goes on as far as the break.
 
@@ -497,7 +378,7 @@ def _beside_breaks(
     """
     xp, (height, width) = namespace(color), color.shape[:2]
     y, x, row = (outlines.gap[:, i] for i in range(3))
-    normal = segments.normals(breaks)
+    normal = normals(outlines.gap, outlines.place, outlines.ties)
     ahead = xp.sum(normal * breaks.step, axis=-1)
     flat_color, flat_motion = (xp.reshape(t, (-1, t.shape[-1])) for t in (color, motion))
     joined, parts = xp.reshape(outlines.joined, (2, -1)), []

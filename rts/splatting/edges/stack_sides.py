@@ -13,6 +13,7 @@ from rts.compiling.threads import read_only
 from rts.contracts.records import Outlines
 from rts.operations.operation import Arrays, Operation, Some
 from rts.splatting.cells import over, unpack
+from rts.splatting.edges.gap_places import normals, on_gaps, steps
 
 
 class Stack(NamedTuple):
@@ -81,7 +82,7 @@ class _Known(NamedTuple):
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:
     known, xp, engine, (layers, height, width) = _Known(*arrays), namespace(rgba), engine_of(rgba), row.shape
-    gap, place, unit = known.gap, known.place, _normals(known)
+    gap, place, unit = known.gap, known.place, normals(known.gap, known.place, known.ties)
     along, gaps = steps(gap, unit), xp.concat([gap, gap])
     normal, way = xp.concat([unit, unit]), xp.concat([-along, along])
     first, next_ = gap[:, 0] * width + gap[:, 1], xp.where(gap[:, 2] == 1, 1, width)
@@ -109,39 +110,6 @@ def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) ->
     parts, cells = xp.concat([share * change, (1 - share) * change]), xp.concat([cell, beyond])
     total = xp.reshape(engine.segment_sum(parts, cells, height * width), (height, width, -1))
     return total - stopped(total)
-
-
-def on_gaps(gap: Array, places: Array) -> Array:
-    """Points (B, ..., 2) at places (B, ...) along gaps (B, 3)."""
-    xp = namespace(places)
-    first, along = xp.astype(xp.stack([gap[:, 1], gap[:, 0]], axis=-1), places.dtype) + 0.5, steps(gap, places)
-    if places.ndim == 2:
-        first, along = first[:, None, :], along[:, None, :]
-    return first + places[..., None] * along
-
-
-def steps(gap: Array, like: Array) -> Array:
-    """Unit steps (B, 2) along gaps (B, 3)."""
-    xp = namespace(gap)
-    return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
-
-
-def _normals(known: _Known) -> Array:
-    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
-    xp, ties, place = namespace(known.place), known.ties, on_gaps(known.gap, known.place)
-    engine, count = engine_of(place), place.shape[0]
-    step = steps(known.gap, place)
-    ends = [xp.take(place, xp.where(ties[:, i] >= 0, ties[:, i], 0), axis=0) for i in (0, 1)]
-    way, total = ends[1] - ends[0], step * 1e-6
-    normal = xp.stack([way[:, 1], -way[:, 0]], axis=-1)
-    counts = (ties[:, 1] >= 0) & (ties[:, 0] != ties[:, 1])
-    for i in (0, 1):
-        at = xp.where(counts, ties[:, i], 0)
-        # Two segments at a line of crossing may run in opposite directions.
-        forward = xp.sum(normal * xp.take(step, at, axis=0), axis=-1) >= 0
-        turned = xp.where(counts[:, None], xp.where(forward[:, None], normal, -normal), 0.0)
-        total = total + engine.segment_sum(turned, at, count)
-    return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
 
 
 def _shape(

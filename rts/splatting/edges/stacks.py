@@ -25,7 +25,8 @@ from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
 from rts.operations.operation import Arrays, Operation, Some
 from rts.splatting.cells import centres
-from rts.splatting.edges.stack_sides import Stack, motion_beside_breaks, on_gaps
+from rts.splatting.edges.gap_places import on_gaps
+from rts.splatting.edges.stack_sides import Stack, motion_beside_breaks
 
 
 class Operands(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.splatting.edges.weights_loops import fill_normals
 
 
 @compiled
@@ -158,28 +159,6 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
 
 
 @compiled
-def _fill_normals(gap, place, ties, normal):
-    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
-    for b in range(len(gap)):
-        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
-    for s in range(len(ties)):
-        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
-            continue
-        start, end = ties[s, 0], ties[s, 1]
-        nx = gap[end, 0] - gap[start, 0] + place[end] * (1 - gap[end, 2]) - place[start] * (1 - gap[start, 2])
-        ny = gap[start, 1] - gap[end, 1] + place[start] * gap[start, 2] - place[end] * gap[end, 2]
-        for b in (start, end):
-            # Two segments at a line of crossing may run in opposite directions.
-            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
-            normal[b, 0] += sign * nx
-            normal[b, 1] += sign * ny
-    for b in range(len(gap)):
-        length = np.hypot(normal[b, 0], normal[b, 1])
-        normal[b, 0] /= length
-        normal[b, 1] /= length
-
-
-@compiled
 def _color(rgba, n, c):
     """A channel of a sample; 0 for none."""
     return rgba[n, c] if n >= 0 else 0.0
@@ -253,7 +232,7 @@ def weigh_sides(rgba, row, rows, gap, place, ends, ties, stack, change, moves, m
         share: (S,) to fill, what the first cell has of the change.
     """
     normal, through, behind = np.empty((len(gap), 2)), np.empty(len(row)), np.empty((len(row), rgba.shape[1]))
-    _fill_normals(gap, place, ties, normal)
+    fill_normals(gap, place, ties, normal)
     for s in range(len(cells)):
         b, i, cells[s] = s // 2, s % 2, -1
         if not (ends[b, i] and stack[b, i, 0] >= 0):

@@ -64,18 +64,18 @@ class _Weights(NamedTuple):
         shown, movers, near = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), outlines.near
         points, origins = np.empty((count, 2, 2)), np.empty((count, 2, 2))
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
-        path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
+        share, flux = np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
         cell_side, lost = np.empty((segments, 4, 2), np.int8), np.empty((segments, 4, 2))
         of_samples = outlines.rows, outlines.inner, outlines.pair, outlines.points
         loops.weigh_breaks(gap, near, outlines.slope, *of_samples, shown, points, movers, origins, moves)
         ties = outlines.ties
         geometry = ties, outlines.square_sides, outlines.hub, outlines.corner, outlines.pull
-        known = outlines.square, *geometry, path, share, cell_side, lost, flux
+        known = outlines.square, *geometry, share, cell_side, lost, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
         parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=250 * segments)
         normal = np.empty((count, 2))
-        loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
+        loops.weigh_sides(*at, ties, outlines.joined, normal, cells, sides)
         return cls(shown, points, movers, origins, moves, share, cell_side, lost, flux, cells, sides)
 
 

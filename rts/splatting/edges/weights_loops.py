@@ -83,14 +83,6 @@ def _place(x, y, side):
 
 
 @compiled
-def _right_of_bottom(start, end, clockwise, low, high):
-    """The length, between two places on the sides, of what lies on the right of the way from `start` to `end`."""
-    a, b = (start, end) if clockwise else (end, start)
-    between = max(min(max(b, low), high) - min(max(a, low), high), 0.0)
-    return high - low - between if clockwise else between
-
-
-@compiled
 def _next_side(side, k, is_first, is_last):
     """The side of a break, 0 or 1, that a square's corner is next to; −1 if another break lies between, or no gap."""
     begins, stops = is_first and k == (0, 1, 3, 0)[side], is_last and k == (1, 2, 2, 3)[side]
@@ -105,107 +97,84 @@ def _point(place, x, y, along):
 
 
 @compiled
-def _add_flux(flux, s, k, pull, i, lone, t, first, second, dx, dy):
-    """Add a straight piece (dx, dy) of a segment, with weights of both jumps, to the flux in its cell k; see below.
-
-    The piece lies at t between start and corner (i = 0), or between corner and end.
-    """
-    for m in range(4):
-        rate = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
-        if lone:
-            rate = 1.0 if m == 1 else 0.0
-        flux[s, k, 0, m, 0] += rate * first * dy
-        flux[s, k, 0, m, 1] -= rate * first * dx
-        flux[s, k, 1, m, 0] += rate * second * dy
-        flux[s, k, 1, m, 1] -= rate * second * dx
-
-
-@compiled
-def _add_piece(flux, area, s, pull, i, lone, piece, share_of, first, second):
-    """Add a straight piece of a segment to the flux in its four cells, and to areas (4,) on the right of the way.
-
-    `piece` are its place t as of `_add_flux`, x and y of its middle, and its way; `share_of` its shares on the right
-    and below. `first` and `second` are weights of both jumps.
-    """
-    t, px, py, dx, dy = piece
-    for k in range(4):
-        east, south = k == 1 or k == 2, k >= 2
-        height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
-        area[k] -= height * dx
-        of_cell = (share_of[0] if east else 1 - share_of[0]) * (share_of[1] if south else 1 - share_of[1])
-        if of_cell > 0 and (first != 0 or second != 0):
-            _add_flux(flux, s, k, pull, i, lone, t, of_cell * first, of_cell * second, dx, dy)
-
-
-@compiled
-def _at_hub(s, hub, found):
-    """Fill `found` with the rows of segments that end at another one, or cross it. Returns their number."""
-    count = 0
+def _at_hub(s, hub, rows):
+    """Fill `rows` with a segment's own and those of segments that end at it, or cross it. Returns their number."""
+    rows[0], count = s, 1
     for h in range(max(s - REACH, 0), min(s + REACH + 1, len(hub))):
         if hub[h] != 0 and h + hub[h] == s:
-            found[count] = h
+            rows[count] = h
             count += 1
     return count
 
 
 @compiled
-def _weigh_ray(flux, weight, s, i, side, border, ray, rates):
+def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
     """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
 
     Args:
         flux: see `weigh_segments`; filled in for segment s and jump i.
-        weight: (4,) to fill: by how much the colours of the cells' quarters rise with the jump, clockwise.
+        weight: (N, 4), to fill row n: by how much the colours of the cells' quarters rise with the jump, clockwise.
         s: the segment.
         i: the jump.
+        n: the row of `weight`.
         side: the side.
         border: see `weigh_segments`.
         ray: (3, 2), the break, a point between, and where the outlines meet.
         rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
+        other: 1 or −1 if the jump goes over to the mean of both of the segment's, and the other one has this sign; else
+            0.
     """
-    cuts, sign = np.empty(4), 1.0 if side < 2 else -1.0
-    start = _place(ray[0, 0], ray[0, 1], side)
+    sign, start = 1.0 if side < 2 else -1.0, _place(ray[0, 0], ray[0, 1], side)
     for k in range(4):
         low = 2.5 if k == 0 or k == 3 else 2.0
-        weight[k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
-    for n in range(2):
-        x, y = ray[n, 0], ray[n, 1]
-        wx, wy = ray[n + 1, 0] - x, ray[n + 1, 1] - y
+        weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
+    for p in range(2):
+        x, y = ray[p, 0], ray[p, 1]
+        wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
         a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
         b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
-        cuts[0], cuts[1], cuts[2], cuts[3] = 0.0, min(a, b), max(a, b), 1.0
         for m in range(3):
-            t, part = (cuts[m] + cuts[m + 1]) / 2, cuts[m + 1] - cuts[m]
-            px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
+            begin, end = (0.0 if m == 0 else (min(a, b) if m == 1 else max(a, b))), 1.0
+            if m < 2:
+                end = min(a, b) if m == 0 else max(a, b)
+            dx, dy, t = (end - begin) * wx, (end - begin) * wy, (begin + end) / 2
+            if dx == 0 and dy == 0:
+                continue
+            px, py = x + t * wx, y + t * wy
             right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
             below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
             for k in range(4):
                 east, south = k == 1 or k == 2, k >= 2
                 height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
-                weight[k] += height * dx
+                weight[n, k] += height * dx
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
-                for r in range(4):
-                    rate = (1 - t) * rates[n, 0, r] + t * rates[n, 1, r]
-                    flux[s, k, i, r, 0] += of_cell * rate * dy
-                    flux[s, k, i, r, 1] -= of_cell * rate * dx
+                if of_cell != 0:
+                    for r in range(4):
+                        rate = of_cell * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
+                        flux[s, k, i, r, 0] += (1 - 0.5 * t * abs(other)) * rate * dy
+                        flux[s, k, i, r, 1] -= (1 - 0.5 * t * abs(other)) * rate * dx
+                        flux[s, k, 1 - i, r, 0] -= 0.5 * t * other * sign * rate * dy
+                        flux[s, k, 1 - i, r, 1] += 0.5 * t * other * sign * rate * dx
 
 
 @compiled
-def _along(a, b, point):
-    """Where on a straight piece a point lies, 0 to 1, and its squared distance from there."""
-    dx, dy = b[0] - a[0], b[1] - a[1]
+def _along(ax, ay, bx, by, x, y):
+    """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
+    dx, dy = bx - ax, by - ay
     square = dx * dx + dy * dy
-    t = ((point[0] - a[0]) * dx + (point[1] - a[1]) * dy) / square if square > 0 else 0.0
+    t = ((x - ax) * dx + (y - ay) * dy) / square if square > 0 else 0.0
     t = min(max(t, 0.0), 1.0)
-    return t, (a[0] + t * dx - point[0]) ** 2 + (a[1] + t * dy - point[1]) ** 2
+    return t, (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
 
 
 @compiled
-def _fill_path(s, place, gap, square, ties, corner, path):
-    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre; see `weigh_segments`."""
+def _fill_path(path, s, place, gap, square, ties, corner):
+    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
     for e in range(2):
         b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-        path[2 * e] = _point(place[b], gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0], gap[b, 2])
-    path[1] = corner[s]
+        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+        path[2 * e, 0], path[2 * e, 1] = _point(place[b], x, y, gap[b, 2])
+    path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
 
 
 @compiled
@@ -214,74 +183,43 @@ def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
 
     `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
     """
-    ray[0], ray[2], rates[:] = path[2 * e], of_hub[1], 0.0
-    rates[0, 0, 1 + e], rates[1, 1] = 1.0, pull[h]
-    if s == h:
-        ray[1], rates[0, 1] = (path[2 * e] + path[1]) / 2, (rates[0, 0] + pull[s]) / 2
-        rates[1, 0] = rates[0, 1]
-        return
-    first, near = _along(of_hub[0], of_hub[1], path[1])
-    second, far = _along(of_hub[2], of_hub[1], path[1])
-    t, own = (first, 0) if near <= far else (second, 3)
-    ray[1], rates[1, 0] = path[1], t * pull[h]
-    rates[1, 0, own] += 1 - t
-    share = _along(path[0], path[2], path[1])[0]
-    rates[0, 1, 1], rates[0, 1, 2] = 1 - share, share
+    t, own, share = 0.0, 1 + e, 0.0
+    if s != h:
+        x, y = path[1, 0], path[1, 1]
+        first, near = _along(of_hub[0, 0], of_hub[0, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        second, far = _along(of_hub[2, 0], of_hub[2, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        t, own = (first, 0) if near <= far else (second, 3)
+        share, _ = _along(path[0, 0], path[0, 1], path[2, 0], path[2, 1], x, y)
+    for a in range(2):
+        ray[0, a], ray[1, a], ray[2, a] = path[2 * e, a], path[1, a], of_hub[1, a]
+    for r in range(4):
+        rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
+        rates[0, 1, r] = pull[s, r] if s == h else (1 - share if r == 1 else (share if r == 2 else 0.0))
+        rates[1, 0, r] = t * pull[h, r] + (1 - t if r == own else 0.0)
+        rates[1, 1, r] = pull[h, r]
 
 
 @compiled
-def _weigh_meeting(
-    s, others, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, share, cell_side, lost,
-    flux,
-):  # fmt: skip
-    """Fill in the weights of a segment s and of those, rows `others`, that end at it or cross it; see `weigh_segments`.
-
-    Each of their outlines goes from its break to the segment's corner, and between them lie as many surfaces.
-    """
-    most, count = 2 * (1 + len(others)), 0
-    ray, rates, of_hub, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
-    weights, at, sides = np.empty((most, 4)), np.empty(most), np.empty(most, np.int64)
-    owners, jumps = np.empty(most, np.int64), np.empty(most, np.int64)
-    _fill_path(s, place, gap, square, ties, corner, of_hub)
-    for n in range(most):
-        owner, e = s if n < 2 else others[n // 2 - 1], n % 2
-        if e == 0:
-            flux[owner], share[owner], lost[owner], cell_side[owner] = 0.0, 0.0, 0.0, -1
-        if ties[owner, e] < 0:
-            continue
-        side = square_sides[owner, e]
-        _fill_path(owner, place, gap, square, ties, corner, path)
-        _fill_ray(s, owner, e, of_hub, path, pull, ray, rates)
-        _weigh_ray(flux, weights[count], owner, e, side, border, ray, rates)
-        owners[count], jumps[count], sides[count], at[count] = owner, e, side, _place(ray[0, 0], ray[0, 1], side)
-        for k in range(4):
-            share[owner, k, e] = -weights[count, k] if side < 2 else weights[count, k]
-        count += 1
-    for k in range(4):
-        # Clockwise, the breaks before and after the corner, between which its surface lies.
-        before, after = -1, -1
-        for e in range(count):
-            if before < 0 or (sides[e] < k, at[e], sides[e]) > (sides[before] < k, at[before], sides[before]):
-                before = e
-            if after < 0 or (sides[e] < k, at[e], sides[e]) < (sides[after] < k, at[after], sides[after]):
-                after = e
-        one, other, i, j = int(sides[before] < 2), int(sides[after] >= 2), jumps[before], jumps[after]
-        b, c = ties[owners[before], i], ties[owners[after], j]
-        next_b = _next_side(sides[before], k, near_ends[b, 0], near_ends[b, 1])
-        next_c = _next_side(sides[after], k, near_ends[c, 0], near_ends[c, 1])
-        known = (next_b == one or next_c == other) and next_b != 1 - one and next_c != 1 - other
-        if known and seen[b, one] and seen[c, other]:
-            cell_side[owners[before], k, i], cell_side[owners[after], k, j] = one, other
-            own = max(weights[after, k] - weights[before, k], 0.0) / 2
-            lost[owners[before], k, i] = lost[owners[after], k, j] = own
+def _next_breaks(k, count, sides, at):
+    """The rays whose breaks come before and after a corner of a square, clockwise."""
+    before, after = 0, 0
+    for e in range(1, count):
+        if (sides[e] < k, at[e], sides[e]) > (sides[before] < k, at[before], sides[before]):
+            before = e
+        if (sides[e] < k, at[e], sides[e]) < (sides[after] < k, at[after], sides[after]):
+            after = e
+    return before, after
 
 
 @loop
 def weigh_segments(
-    first, last, border, place, gap, near_ends, seen, square, ties, square_sides, hub, corner, pull, path, share,
-    cell_side, lost, flux,
+    first, last, border, place, gap, near_ends, seen, square, ties, square_sides, hub, corner, pull, share, cell_side,
+    lost, flux,
 ):  # fmt: skip
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
+
+    From each break on a square's sides an outline goes to a point inside, the corner of its segment, or of the one that
+    this ends at. Between the breaks that meet there lie as many surfaces.
 
     Args:
         first: the first segment.
@@ -297,7 +235,6 @@ def weigh_segments(
         hub: (S,).
         corner: (S, 2).
         pull: (S, 4).
-        path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
         share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps at start and end.
         cell_side: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that its
             centre shows; −1 if another may lie between.
@@ -305,76 +242,75 @@ def weigh_segments(
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
             that pull.
     """
-    cuts, area, rows = np.empty(4), np.empty(4), np.empty(2 * REACH, np.int64)
+    most = 2 * (2 * REACH + 1)
+    rows, owners, jumps = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    sides, weight, at = np.empty(most, np.int64), np.empty((most, 4)), np.empty(most)
+    ray, rates, of_hub, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
     for s in range(first, last):
         if ties[s, 0] == ties[s, 1]:
-            path[s], share[s], cell_side[s], lost[s], flux[s] = 0.0, 0.0, -1, 0.0, 0.0
+            share[s], cell_side[s], lost[s], flux[s] = 0.0, -1, 0.0, 0.0
             continue
-        lone = ties[s, 1] < 0
-        _fill_path(s, place, gap, square, ties, corner, path[s])
         if hub[s] != 0:
             continue  # Its weights are filled in with those of that segment.
-        count = _at_hub(s, hub, rows)
-        if count > 0:
-            of_breaks = place, gap, near_ends, seen
-            of_segments = square, ties, square_sides, corner, pull, share, cell_side, lost, flux
-            _weigh_meeting(s, rows[:count], border, *of_breaks, *of_segments)
-            continue
-        flux[s] = 0.0
-        side0 = square_sides[s, 0]
-        side1 = (side0 + 2) % 4 if lone else square_sides[s, 1]
-        if lone:
-            along = gap[ties[s, 0], 2]
-            path[s, 2, 0] = path[s, 0, 0] if along == 1 else 1 - path[s, 0, 0]
-            path[s, 2, 1] = 1 - path[s, 0, 1] if along == 1 else path[s, 0, 1]
-            path[s, 1] = (path[s, 0] + path[s, 2]) / 2
-        # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
-        sign0 = 1.0 if side0 < 2 else -1.0
-        sign1 = sign0 if lone else (1.0 if side1 >= 2 else -1.0)
-        chord_x, chord_y = path[s, 2, 0] - path[s, 0, 0], path[s, 2, 1] - path[s, 0, 1]
-        length = chord_x * chord_x + chord_y * chord_y
-        turn = (path[s, 1, 0] - path[s, 0, 0]) * chord_x + (path[s, 1, 1] - path[s, 0, 1]) * chord_y
-        turn = turn / length if length > 0 else 0.0
-        start, end = _place(path[s, 0, 0], path[s, 0, 1], side0), _place(path[s, 2, 0], path[s, 2, 1], side1)
-        # Two sides meet in a corner, which an outline may pass through.
-        clockwise = start < end or (start == end and side0 < side1)
-        area[0] = area[3] = 0.5 * _right_of_bottom(start, end, clockwise, 2.5, 3.0)
-        area[1] = area[2] = 0.5 * _right_of_bottom(start, end, clockwise, 2.0, 2.5)
-        for i in range(2):
-            x, y = path[s, i, 0], path[s, i, 1]
-            wx, wy = path[s, i + 1, 0] - x, path[s, i + 1, 1] - y
-            cuts[0], cuts[3] = 0.0, 1.0
-            a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
-            b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
-            cuts[1], cuts[2] = min(a, b), max(a, b)
-            for n in range(3):
-                t, part = (cuts[n] + cuts[n + 1]) / 2, cuts[n + 1] - cuts[n]
-                if part == 0:
-                    continue
-                px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
-                u = t * turn if i == 0 else (1 - t) * turn + t
-                counts = not lone or abs(px - path[s, 0, 0]) + abs(py - path[s, 0, 1]) <= 0.5
-                share_of = min(max((px - 0.5) / border + 0.5, 0.0), 1.0), min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
-                piece = t, px, py, dx, dy
-                _add_piece(flux, area, s, pull, i, lone, piece, share_of, counts * (1 - u) * sign0, counts * u * sign1)
+        _fill_path(of_hub, s, place, gap, square, ties, corner)
+        total, count = _at_hub(s, hub, rows), 0
+        both = total == 1 and ties[s, 1] >= 0
+        for n in range(total):
+            h = rows[n]
+            share[h], cell_side[h], lost[h], flux[h] = 0.0, -1, 0.0, 0.0
+            _fill_path(path, h, place, gap, square, ties, corner)
+            for e in range(2 if ties[h, 1] >= 0 else 1):
+                side, other = square_sides[h, e], 0.0
+                if both:
+                    other = 1.0 if square_sides[h, 1 - e] < 2 else -1.0
+                _fill_ray(s, h, e, of_hub, path, pull, ray, rates)
+                _weigh_ray(flux, weight, h, e, count, side, border, ray, rates, other)
+                owners[count], jumps[count], sides[count], at[count] = h, e, side, _place(ray[0, 0], ray[0, 1], side)
+                count += 1
         for k in range(4):
-            # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
-            after, until = side0 >= k, side1 >= k
-            on_right = (after or not until) if clockwise else (after and not until)
-            counts = not lone or side0 == k or side0 == (k + 3) % 4
-            beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
-            share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
-            lost[s, k, 0] = lost[s, k, 1] = abs(beside)
-            first, second = int((sign0 > 0) != on_right), int((sign1 > 0) != on_right)
-            at_start = _next_side(side0, k, near_ends[ties[s, 0], 0], near_ends[ties[s, 0], 1])
-            at_end = -1 if lone else _next_side(side1, k, near_ends[ties[s, 1], 0], near_ends[ties[s, 1], 1])
-            known = (at_start == first or at_end == second) and at_start != 1 - first and at_end != 1 - second
-            known = known and seen[ties[s, 0], first] and seen[ties[s, 0] if lone else ties[s, 1], second]
-            cell_side[s, k, 0], cell_side[s, k, 1] = (first, second) if known else (-1, -1)
+            # Jumps around a point add up to 0; those of colours that change along outlines hardly miss it.
+            mean = 0.0
+            for e in range(count):
+                mean += weight[e, k] / count
+            for e in range(count):
+                share[owners[e], k, jumps[e]] = mean - weight[e, k] if sides[e] < 2 else weight[e, k] - mean
+            # Between the breaks before and after the cell's corner, clockwise, lies the surface that is seen there.
+            before, after = _next_breaks(k, count, sides, at)
+            one, other, i, j = int(sides[before] < 2), int(sides[after] >= 2), jumps[before], jumps[after]
+            b, c = ties[owners[before], i], ties[owners[after], j]
+            next_b = _next_side(sides[before], k, near_ends[b, 0], near_ends[b, 1])
+            next_c = _next_side(sides[after], k, near_ends[c, 0], near_ends[c, 1])
+            known = (next_b == one or next_c == other) and next_b != 1 - one and next_c != 1 - other
+            if known and seen[b, one] and seen[c, other]:
+                own = max(weight[after, k] - weight[before, k], 0.0) / 2
+                cell_side[owners[before], k, i], cell_side[owners[after], k, j] = one, other
+                lost[owners[before], k, i] = lost[owners[after], k, j] = own
+
+
+@compiled
+def fill_normals(gap, place, ties, normal):
+    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    for b in range(len(gap)):
+        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
+    for s in range(len(ties)):
+        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
+            continue
+        start, end = ties[s, 0], ties[s, 1]
+        nx = gap[end, 0] - gap[start, 0] + place[end] * (1 - gap[end, 2]) - place[start] * (1 - gap[start, 2])
+        ny = gap[start, 1] - gap[end, 1] + place[start] * gap[start, 2] - place[end] * gap[end, 2]
+        for b in (start, end):
+            # Two segments at a line of crossing may run in opposite directions.
+            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
+            normal[b, 0] += sign * nx
+            normal[b, 1] += sign * ny
+    for b in range(len(gap)):
+        length = np.hypot(normal[b, 0], normal[b, 1])
+        normal[b, 0] /= length
+        normal[b, 1] /= length
 
 
 @loop
-def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, sides):
+def weigh_sides(place, gap, near_ends, seen, ties, joined, normal, cells, sides):
     """Fill in the weights of the surfaces on both sides of breaks.
 
     Args:
@@ -383,7 +319,6 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
         near_ends: (B, 2), `Outlines.ends`.
         seen: (B, 2) bool, is there a sample before and behind?
         ties: (S, 2).
-        path: (S, 3, 2), see `weigh_segments`.
         joined: (2, H, W).
         normal: (B, 2) to fill.
         cells: (B, 2, 3) int32 to fill, for each side: the gap's cell on it (flat), the other one, and the one before,
@@ -393,21 +328,9 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
             those of motions along x and y.
     """
     (height, width), count = joined.shape[1:], len(place)
+    fill_normals(gap, place, ties, normal)
     for b in range(count):
-        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
-    for s in range(len(ties)):
-        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
-            continue
-        nx, ny = path[s, 2, 1] - path[s, 0, 1], path[s, 0, 0] - path[s, 2, 0]
-        for e in range(2):
-            b = ties[s, e]
-            # Two segments at a line of crossing may run in opposite directions.
-            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
-            normal[b, 0] += sign * nx
-            normal[b, 1] += sign * ny
-    for b in range(count):
-        length = np.hypot(normal[b, 0], normal[b, 1])
-        nx, ny = normal[b, 0] / length, normal[b, 1] / length
+        nx, ny = normal[b, 0], normal[b, 1]
         y, x, row = gap[b, 0], gap[b, 1], gap[b, 2]
         ahead, step = nx * row + ny * (1 - row), row + (1 - row) * width
         for i in range(2):
