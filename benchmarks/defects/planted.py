@@ -209,9 +209,23 @@ LOOPS = [
     Defect(
         "flux along y has the sign of that along x",
         "rts/splatting/edges/weights_loops.py",
-        "flux[s, k, 0, m, 1] -= rate * first * dx",
-        "flux[s, k, 0, m, 1] += rate * first * dx",
+        "flux[s, k, i, r, 1] -= rate * dx",
+        "flux[s, k, i, r, 1] += rate * dx",
         "edges edges_bodies edges_soups",
+    ),
+    Defect(
+        "outlines of glass do not cross",
+        "rts/outlines/segments_loops.py",
+        "crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)",
+        "crosses = False",
+        "edges_meetings",
+    ),
+    Defect(
+        "outlines that end at another one move with it all the way",
+        "rts/splatting/edges/weights_loops.py",
+        "(1 - share if r == 1 else (share if r == 2 else 0.0))",
+        "pull[h, r]",
+        "edges_meetings edges_soups",
     ),
     Defect(
         "lines of crossing do not know of depth",
@@ -223,8 +237,8 @@ LOOPS = [
     Defect(
         "gradients of opacity forget the light that passes",
         "rts/splatting/edges/stacks_loops.py",
-        "g_rgba[n, count - 1] -= through[k] * hidden",
-        "g_rgba[n, count - 1] -= hidden",
+        "g_rgba[n, alpha] -= light * behind",
+        "g_rgba[n, alpha] -= behind",
         "edges_operations",
     ),
     Defect(

@@ -6,7 +6,8 @@ long, a message on the terminal says so.
 numba counts references to arrays, one thread after the other: in a loop that is nothing but helpers and views, this can
 be most of the time. A helper that is called for each item counts none if it takes few arrays, has one `return`, no
 `break`, and uses all of them to its end. Views (`a[i]`, `a[b:e]`) and tuples of arrays are counted wherever they are
-made; whole arrays with indices, numbers, and tuples of numbers are not.
+made; whole arrays with indices, numbers, and tuples of numbers are not. A helper with `inline="always"` becomes a part
+of the loop and counts none either: a tenth of the time of loops over outlines. Large ones take longer to compile.
 """
 
 from __future__ import annotations

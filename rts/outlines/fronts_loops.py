@@ -33,13 +33,13 @@ SHORT = 2e-5
 """Length of a piece of front that counts."""
 
 
-@compiled
+@compiled(inline="always")
 def depth_at(spans, i, place):
     """The depth of a span at a place."""
     return (spans[i, 2] + spans[i, 3] * place) / (spans[i, 4] + spans[i, 5] * place)
 
 
-@compiled
+@compiled(inline="always")
 def _rest(spans, begin, stop, place):
     """The first of a gap's spans, `begin` to `stop`, which are sorted by starts, that may not have ended at a place."""
     while begin < stop and spans[begin, 1] <= place:
@@ -47,7 +47,7 @@ def _rest(spans, begin, stop, place):
     return begin
 
 
-@compiled
+@compiled(inline="always")
 def _nearest(spans, begin, stop, place, beyond):
     """The nearest of a gap's spans, `begin` to `stop`, that covers `place`, and goes on after it; −1 for none."""
     best = NOTHING
@@ -60,7 +60,7 @@ def _nearest(spans, begin, stop, place, beyond):
     return best
 
 
-@compiled
+@compiled(inline="always")
 def _next_start(spans, begin, stop, place):
     """The least start of a span of a gap at or after a place; infinite if there is none."""
     for i in range(begin, stop):
@@ -69,7 +69,7 @@ def _next_start(spans, begin, stop, place):
     return np.inf
 
 
-@compiled
+@compiled(inline="always")
 def _overtaken(spans, begin, stop, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
     best, by = spans[x, 1], -9
@@ -96,7 +96,7 @@ def _overtaken(spans, begin, stop, x, place):
     return best, by
 
 
-@compiled
+@compiled(inline="always")
 def _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts):
     """The fronts along a gap: which span is the nearest, and from which place on. Returns their number.
 
@@ -145,7 +145,7 @@ def _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts
     return n
 
 
-@compiled
+@compiled(inline="always")
 def _all_of(pieces, count, parts, part):
     """True if none of some pieces of front is another part's."""
     found = True
@@ -154,7 +154,7 @@ def _all_of(pieces, count, parts, part):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _agree(spans, begin, stop, seen, depth, centre):
     """Empty the spans that reach over a centre before what is seen there: they touch the line with an edge alone."""
     for i in range(begin, stop):
@@ -163,7 +163,7 @@ def _agree(spans, begin, stop, seen, depth, centre):
                 spans[i, 1] = EMPTY
 
 
-@compiled
+@compiled(inline="always")
 def _goes_on(spans, begin, stop, parts, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
     found, z = False, depth_at(spans, x, place)
@@ -176,7 +176,7 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _kind(before, behind, nearer, stops, starts):
     """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
 
@@ -325,7 +325,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, trian
             b += 1
 
 
-@compiled
+@compiled(inline="always")
 def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
     """Fill in the samples that tell colours of the breaks of a gap, from the row `at`; see `breaks`."""
     for b in range(at, at + count):
@@ -341,13 +341,13 @@ def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
                 numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
 
 
-@compiled
+@compiled(inline="always")
 def _part(g, parts, ends, x):
     """The part of a piece of front of a gap."""
     return parts[x] if x >= 0 else (ends[g, 0, 0] if x == FIRST else (ends[g, 1, 0] if x == SECOND else np.int32(-1)))
 
 
-@compiled
+@compiled(inline="always")
 def _piece(pieces, starts, count, place):
     """The piece of front at a place of a gap."""
     n = 0

@@ -75,7 +75,7 @@ def ends_of(gap, place, near, parts, height, width):
     return square[:count], along[:count], ends[:count]
 
 
-@compiled
+@compiled(inline="always")
 def _join(begins, ends, place, tangent, cells_away, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
@@ -112,7 +112,7 @@ def _join(begins, ends, place, tangent, cells_away, partner):
         _read(first, n, step, partner)
 
 
-@compiled
+@compiled(inline="always")
 def _cost(a, b, ends, place, tangent, cells_away):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
@@ -135,7 +135,7 @@ def _cost(a, b, ends, place, tangent, cells_away):
     return cost + OTHER_KIND * crosses + OTHER_DEPTH * apart / (apart + FAR)
 
 
-@compiled
+@compiled(inline="always")
 def _read(first, n, step, partner):
     """Fill in the partners of the n ends from `first` on, as `step` says of all runs of ends."""
     stack, top = np.empty((2 * n + 2, 2), np.int32), 1
@@ -214,7 +214,7 @@ def ending(near, parts, triangles):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _beyond(ties, place):
     """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
 
@@ -248,19 +248,19 @@ def _beyond(ties, place):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _row(table, n):
     """A row of a table (N, 2) as two numbers."""
     return table[n, 0], table[n, 1]
 
 
-@compiled
+@compiled(inline="always")
 def _minus(a, b):
     """The difference of two vectors."""
     return a[0] - b[0], a[1] - b[1]
 
 
-@compiled
+@compiled(inline="always")
 def _meeting(start, ahead, end, back):
     """Where lines from `start` along `ahead` and to `end` along `back` meet, and True if that is between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
@@ -272,13 +272,13 @@ def _meeting(start, ahead, end, back):
     return meeting, t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
 
 
-@compiled
+@compiled(inline="always")
 def _angle(a, b):
     """The angle between two vectors, 0 to π."""
     return abs(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
 
 
-@compiled
+@compiled(inline="always")
 def _inward(tangent, side):
     """A direction, turned into a square from one of its sides."""
     into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
@@ -286,7 +286,7 @@ def _inward(tangent, side):
     return sign * tangent[0], sign * tangent[1]
 
 
-@compiled
+@compiled(inline="always")
 def _within(point, origin, s):
     """True if a point lies in the square of a segment, or `CLOSE` to it: a vertex may lie on a side, or at a centre."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
@@ -362,7 +362,7 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         corner[s, 1] = min(max(y - (origin[s, 0] + 0.5), 0.0), 1.0)
 
 
-@compiled
+@compiled(inline="always")
 def _towards(start, way, a, b):
     """The point of a straight piece from a to b that is seen nearest along a direction from a point.
 
@@ -378,20 +378,20 @@ def _towards(start, way, a, b):
     return t, abs(way[0] * dy - way[1] * dx) + max(-ahead, 0.0), ahead
 
 
-@compiled
+@compiled(inline="always")
 def _around(point, origin, s, side):
     """A place on the sides of a segment's square, clockwise from the upper left corner, 0 to 4."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
     return x if side == 0 else (1 + y if side == 1 else (3 - x if side == 2 else 4 - y))
 
 
-@compiled
+@compiled(inline="always")
 def _between(at, start, end):
     """True if a place on the sides of a square comes after `start` and before `end`, clockwise."""
     return start < at < end if start < end else at > start or at < end
 
 
-@compiled
+@compiled(inline="always")
 def _on_segment(origin, s, e, ties, place, corner):
     """The end e of a segment, and its corner, from the square's first centre."""
     left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
@@ -399,7 +399,7 @@ def _on_segment(origin, s, e, ties, place, corner):
     return (end[0] - left, end[1] - top), _row(corner, s)
 
 
-@compiled
+@compiled(inline="always")
 def _end_at(s, other, way, origin, ties, place, around, corner):
     """Where the outline of the lone break of a segment would end at another one; see `meet`.
 
@@ -418,17 +418,19 @@ def _end_at(s, other, way, origin, ties, place, around, corner):
     return best, least + (0.0 if hidden else ON_FRONT), nearest
 
 
-@compiled
+@compiled(inline="always")
 def _apart(first, stop, s, other, ties, around):
     """True if a segment of the same square lies between the start of s and another one."""
+    at, found = around[s, 0], False
     for c in range(first, stop):
         low, high = min(around[c, 0], around[c, 1]), max(around[c, 0], around[c, 1])
-        if c != other and ties[c, 1] >= 0 and (low < around[s, 0] < high) != (low < around[other, 0] < high):
-            return True
-    return False
+        inside = low <= min(around[other, 0], around[other, 1]) and max(around[other, 0], around[other, 1]) <= high
+        between = (at < low or at > high) if inside else low < at < high
+        found |= between and c != other and ties[c, 1] >= 0
+    return found
 
 
-@compiled
+@compiled(inline="always")
 def _crossing(s, other, origin, ties, place, corner):
     """Where a segment crosses another one: the place on that one, 0 to 2, its corner at 1; −1 if it does not."""
     for e in range(2):
@@ -444,6 +446,27 @@ def _crossing(s, other, origin, ties, place, corner):
             if 0 <= t <= 1 and 0 <= u <= 1:
                 return t if e == 0 else 2 - t
     return -1.0
+
+
+@compiled(inline="always")
+def _hub(first, stop, s, way, origin, ties, place, around, hub, corner):
+    """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
+    step, on, least, nearest = 0, 0.0, np.inf, np.inf
+    for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
+        if ties[other, 1] < 0 or other == s:
+            continue
+        if ties[s, 1] < 0:
+            t, off, ahead = _end_at(s, other, way, origin, ties, place, around, corner)
+            nearer = off < least - ALIKE or (off < least + ALIKE and ahead < nearest)
+            if nearer and not _apart(first, stop, s, other, ties, around):
+                step, on, least, nearest = other - s, t, off, ahead
+            continue
+        low, high = min(around[other, 0], around[other, 1]), max(around[other, 0], around[other, 1])
+        crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)
+        if crosses and other < s and step == 0 and hub[other] == 0:
+            on = _crossing(s, other, origin, ties, place, corner)
+            step = other - s if on >= 0 else 0
+    return step, on
 
 
 @loop
@@ -465,27 +488,12 @@ def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
         while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
             stop += 1
         for s in range(first, stop) if stop - first > 1 else range(0):
-            way, least, nearest = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0]), np.inf, np.inf
-            for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
-                if ties[other, 1] < 0 or other == s:
-                    continue
-                if ties[s, 1] >= 0:
-                    low, high = min(around[other, 0], around[other, 1]), max(around[other, 0], around[other, 1])
-                    crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)
-                    if other < s and crosses and hub[s] == 0 and hub[other] == 0:
-                        on[s] = _crossing(s, other, origin, ties, place, corner)
-                        hub[s] = other - s if on[s] >= 0 else 0
-                    continue
-                t, off, ahead = _end_at(s, other, way, origin, ties, place, around, corner)
-                if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
-                    if not _apart(first, stop, s, other, ties, around):
-                        hub[s], on[s], least, nearest = other - s, t, off, ahead
+            way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
+            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, around, hub, corner)
         first = stop
     for s in range(count):
-        if hub[s] != 0 and hub[s + hub[s]] != 0:
-            hub[s] = 0  # What crosses another one is no hub.
-    for s in range(count):
-        if hub[s] == 0:
+        if hub[s] == 0 or hub[s + hub[s]] != 0:
+            hub[s] = 0  # What ends at another one, or crosses it, is no hub.
             continue
         other, e = s + hub[s], 0 if on[s] < 1 else 1
         share = on[s] if e == 0 else 2 - on[s]

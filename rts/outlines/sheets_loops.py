@@ -14,7 +14,7 @@ STEPS = 4096
 """The most triangles of one walk."""
 
 
-@compiled
+@compiled(inline="always")
 def plane_at(corners, sign, x, y):
     """Depth of a triangle's plane at a position, and its slopes along x and y, a pixel."""
     total, total_x, total_y, deep, deep_x, deep_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -65,13 +65,13 @@ def projected(first, last, vertices, rows, seen):
             seen[v] = np.nan
 
 
-@compiled
+@compiled(inline="always")
 def _meets(ax, ay, bx, by):
     """Where an edge between two vertices, on both sides of a line, meets it; of each, its places along it and aside."""
     return ax - ay * (bx - ax) / (by - ay)
 
 
-@compiled
+@compiled(inline="always")
 def _walked(t, target, start, axis, at, seen, faces, beyond):
     """The triangle that a walk from triangle to triangle, a cell along a line of centres, ends on.
 
@@ -124,7 +124,7 @@ def _walked(t, target, start, axis, at, seen, faces, beyond):
     return np.int32(-1)
 
 
-@compiled
+@compiled(inline="always")
 def _touch(faces, t, s):
     """True if two triangles have a corner in common."""
     for i in range(3):
@@ -200,7 +200,7 @@ def on_planes(first, last, triangles, points, rows, vertices, faces, weights, de
             depths[m], weights[m, 0], weights[m, 1] = on_edges(corners, points[m, 0], points[m, 1])
 
 
-@compiled
+@compiled(inline="always")
 def on_edges(corners, x, y):
     """Depth and first two barycentrics of the point of a triangle's edges that is seen nearest to a position."""
     least, z, shares, best = np.inf, 0.0, np.zeros(3), np.zeros(3)

@@ -92,7 +92,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
                 _mark(axis, ends, min(deep[0], deep[1]), part, depth, width, gaps)
 
 
-@compiled
+@compiled(inline="always")
 def _passes_centres(a, b, seen):
     """False for an edge that meets no line of centres, such as most of those that are much shorter than a cell."""
     found = np.isnan(seen[a, 0]) or np.isnan(seen[b, 0])
@@ -102,7 +102,7 @@ def _passes_centres(a, b, seen):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _in_image(a, b, seen, size):
     """False for an edge that lies beyond one border of the image."""
     for axis in range(2):
@@ -113,7 +113,7 @@ def _in_image(a, b, seen, size):
     return True
 
 
-@compiled
+@compiled(inline="always")
 def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
     """Fill in both ends of an edge in the image, and their depths; False if it lies before the near plane.
 
@@ -148,7 +148,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
     return True
 
 
-@compiled
+@compiled(inline="always")
 def _mark(axis, ends, nearest, part, depth, width, gaps):
     """Mark the gaps along an axis that an edge meets; see `meet`, whose depths are compared with the edge's nearest."""
     height, across = part.shape
@@ -210,7 +210,7 @@ def edges(first, last, near, parts, triangles, points, own, rows, vertices, face
                 tangent[b, 0], tangent[b, 1] = _nearest_edge(corners, sign, x, y)
 
 
-@compiled
+@compiled(inline="always")
 def _nearest_edge(corners, sign, x, y):
     """The direction in the image of the edge of a triangle that is nearest to a position."""
     least, along, down = np.inf, 0.0, 0.0

@@ -77,7 +77,7 @@ def number(marks, gap, by_row, by_column):
                 count += 1
 
 
-@compiled
+@compiled(inline="always")
 def _box(a, b, c, seen, height, width, box):
     """Fill `box` with the least x, largest x, least and largest y of a triangle in the image, and a little around.
 
@@ -92,7 +92,7 @@ def _box(a, b, c, seen, height, width, box):
     return area
 
 
-@compiled
+@compiled(inline="always")
 def _range(low, high, count):
     """The first of `count` numbers from `low` to `high`, which may be beyond integers, and the one after the last."""
     return int(min(max(np.ceil(low), 0.0), count)), int(max(min(np.floor(high), count - 1.0), -1.0)) + 1
@@ -109,7 +109,7 @@ def close(first, last, seen, cells, marks):
             marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
 
 
-@compiled
+@compiled(inline="always")
 def _gaps_of(box, axis, by_row, by_column):
     """The lines of centres that a box meets, then the gaps of each: the first and the one after the last."""
     lines, count = by_row.shape if axis == 0 else by_column.shape
@@ -198,7 +198,7 @@ def spans_of(
                 count = _add(t, on_line, least, most, gap, line, corners, names, spans, count)
 
 
-@compiled
+@compiled(inline="always")
 def _add(t, on_line, least, most, gap, line, corners, names, spans, count):
     """Add the spans of a triangle on gaps of a line, where it is seen from `least` to `most`; returns `count`.
 
@@ -215,7 +215,7 @@ def _add(t, on_line, least, most, gap, line, corners, names, spans, count):
     return count
 
 
-@compiled
+@compiled(inline="always")
 def _cut(t, clip, vertices, faces):
     """True if the near or the far plane may cut a triangle."""
     for k in range(3):
@@ -229,7 +229,7 @@ def _cut(t, clip, vertices, faces):
     return False
 
 
-@compiled
+@compiled(inline="always")
 def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
     """Fill `line` with functions c + d · x that are positive on what is seen of a triangle along a line of centres.
 
@@ -250,7 +250,7 @@ def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
             line[3 + p, 1] += value * line[k, 1]
 
 
-@compiled
+@compiled(inline="always")
 def _inside(line, low, high):
     """The interval, within one that is given, where all functions of a line are positive."""
     for k in range(5):
@@ -265,7 +265,7 @@ def _inside(line, low, high):
     return (low, high) if low < high else (0.0, -1.0)
 
 
-@compiled
+@compiled(inline="always")
 def _fill(spans, n, start, end, line, corners, origin):
     """Fill in span n: its ends along a gap that begins at `origin` of a line, and its depth's coefficients."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0

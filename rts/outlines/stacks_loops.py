@@ -31,14 +31,14 @@ PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE = range(7)
 −1; 1 if its run is real; 1 if the run is, or has been, in the stack."""
 
 
-@compiled
+@compiled(inline="always")
 def _alike(own, i, j, place):
     """True if two spans have about one depth at a place."""
     z = depth_at(own, i, place)
     return abs(depth_at(own, j, place) - z) <= ALIKE * abs(z)
 
 
-@compiled
+@compiled(inline="always")
 def _link(own, of, n):
     """Fill in the columns AFTER and BEFORE of n spans."""
     for i in range(n):
@@ -50,7 +50,7 @@ def _link(own, of, n):
                 break
 
 
-@compiled
+@compiled(inline="always")
 def _listed(part, z, seen, depth, g, k):
     """1 if the samples at a centre hold one of a part at a depth; −1 if they hide it; else 0."""
     # Behind all that is listed, where the list is full.
@@ -65,7 +65,7 @@ def _listed(part, z, seen, depth, g, k):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _hides(opaque, z, seen, depth, g, k):
     """True if a sample at a centre hides what lies at a depth."""
     found = False
@@ -74,7 +74,7 @@ def _hides(opaque, z, seen, depth, g, k):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _settle(head, tail, own, of, opaque, seen, depth, g):
     """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
 
@@ -107,14 +107,14 @@ def _settle(head, tail, own, of, opaque, seen, depth, g):
     return real
 
 
-@compiled
+@compiled(inline="always")
 def _before(own, i, j, place, until):
     """True if a span lies before another at a place; if they meet there, farther on."""
     a, b = depth_at(own, i, place), depth_at(own, j, place)
     return a < b if abs(a - b) > ALIKE * abs(a) else depth_at(own, i, until) < depth_at(own, j, until)
 
 
-@compiled
+@compiled(inline="always")
 def _insert(stack, count, i, own, place, until):
     """Insert a span into a stack by depth; returns its index."""
     at = count
@@ -125,14 +125,14 @@ def _insert(stack, count, i, own, place, until):
     return at
 
 
-@compiled
+@compiled(inline="always")
 def _remove(stack, count, at):
     """Remove an entry of a stack."""
     for m in range(at, count - 1):
         stack[m] = stack[m + 1]
 
 
-@compiled
+@compiled(inline="always")
 def _seen(stack, at, most, of):
     """True if an entry of a stack is among the first, and nothing opaque is before it."""
     found = at < most
@@ -141,7 +141,7 @@ def _seen(stack, at, most, of):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _partner(i, n, own, of, place, end, link):
     """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
 
@@ -164,7 +164,7 @@ def _partner(i, n, own, of, place, end, link):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _meeting(own, i, j, low, high):
     """Where two spans have one depth, between two places at which their order differs."""
     wide = (own[i, 4] + own[i, 5] * low) * (own[j, 4] + own[j, 5] * low)
@@ -174,7 +174,7 @@ def _meeting(own, i, j, low, high):
     return low + (high - low) * before / (before - after) if before - after > 0 else low
 
 
-@compiled
+@compiled(inline="always")
 def _next_meeting(stack, count, own, place, until):
     """The next place at which two neighbours in a stack pass through one another, and the first's index; or −1."""
     best, at = np.inf, -1
@@ -188,7 +188,7 @@ def _next_meeting(stack, count, own, place, until):
     return best, at
 
 
-@compiled
+@compiled(inline="always")
 def _next_ending(stack, count, own, of, place):
     """The first run in a stack that ends at a place, or `count`; other runs go on with their next spans there."""
     found = count
@@ -201,7 +201,7 @@ def _next_ending(stack, count, own, of, place):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _next_starting(i, n, own, of, place):
     """The first run from the span i on that starts at a place, and is not in the stack yet; n if there is none."""
     while i < n:
@@ -212,7 +212,7 @@ def _next_starting(i, n, own, of, place):
     return i
 
 
-@compiled
+@compiled(inline="always")
 def _index(stack, count, i):
     """The place of a span in a stack; −1 if it is not there."""
     found = -1
@@ -265,7 +265,7 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
         whole[e, 3 - kind] = samples[e, 2 + k, 0] if k >= 0 else -1
 
 
-@compiled
+@compiled(inline="always")
 def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, samples, places):
     """Fill in the samples of what ends at a change: the last ones, and those that tell colours."""
     e, kind = base + f, whole[base + f, 1]
@@ -301,7 +301,7 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
                 break
 
 
-@compiled
+@compiled(inline="always")
 def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
     """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
     _link(own, of, n)
@@ -328,7 +328,7 @@ def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
     return count + 1
 
 
-@compiled
+@compiled(inline="always")
 def _next_knot(knots, k, known):
     """The first of sorted knots that is greater than number k; the one after it if there is none."""
     found = knots[k + 1]
@@ -339,7 +339,7 @@ def _next_knot(knots, k, known):
     return found
 
 
-@compiled
+@compiled(inline="always")
 def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides):
     """Find the changes of the stack along a gap, and fill them in if asked to; returns their number.
 

@@ -77,7 +77,8 @@ def test_parts_without_transforms_are_bit_for_bit_as_one_at_a_time(singly):
 
 @pytest.mark.parametrize("options", [{}, {"cull": "back"}, {"shader": Glass()}])
 def test_moved_parts_give_the_image_and_the_gradient_of_one_at_a_time(singly, options):
-    transforms, parts = crowd(7, **options)
+    # With a seventh part three breaks lie in one place, and rounding tells which of them are joined.
+    transforms, parts = crowd(6, **options)
     weights = np.random.default_rng(1).normal(size=(*SIZE, 4))
 
     def loss(x):

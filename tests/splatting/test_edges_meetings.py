@@ -44,7 +44,7 @@ def expected(near, far):
 
 
 def panes(near, far, alphas, move=None):
-    """The same of panes of glass."""
+    """An image of a pane of glass before another one; if `move` is given, the near one is moved."""
     unlit, parts = rts.plugin("shaders", "unlit")(opaque=False), []
     for corners, depth, color, alpha in ((near, 3.0, RED, alphas[0]), (far, 4.0, GREEN, alphas[1])):
         vertices = flat(corners, depth)

@@ -12,7 +12,7 @@ from rts.compiling.loops import compiled, loop
 from rts.splatting.edges.weights_loops import fill_normals
 
 
-@compiled
+@compiled(inline="always")
 def _weigh(rgba, row, y, x, samples, layers, through):
     """Fill in the samples (K,) of a cell that light reaches, their layers, and the light; returns their number."""
     light, count, alpha = 1.0, 0, rgba.shape[1] - 1
@@ -25,13 +25,13 @@ def _weigh(rgba, row, y, x, samples, layers, through):
     return count
 
 
-@compiled
+@compiled(inline="always")
 def _rooms(most, count):
     """Room for `_weigh` and `_stack`."""
     return np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most), np.empty((most, count))
 
 
-@compiled
+@compiled(inline="always")
 def _stack(rgba, samples, count, behind):
     """Fill `behind` (K, C), the composite behind each of the first layers of a cell."""
     alpha = rgba.shape[1] - 1
@@ -44,7 +44,7 @@ def _stack(rgba, samples, count, behind):
             behind[k - 1, c] = rgba[n, c] + passed * behind[k, c]
 
 
-@compiled
+@compiled(inline="always")
 def _beside(row, joined, k, y, x, axis):
     """The samples of layer k in the cells before and after a cell along an axis; its own where they are not joined."""
     dy, dx, n = axis, 1 - axis, row[k, y, x]
@@ -53,7 +53,7 @@ def _beside(row, joined, k, y, x, axis):
     return np.uint32(before if before >= 0 else n), np.uint32(after if after >= 0 else n)
 
 
-@compiled
+@compiled(inline="always")
 def _change(rgba, behind, k, light, before, after, c):
     """By how much channel c of a composite changes from cell to cell as a layer alone shifts.
 
@@ -73,20 +73,24 @@ def _change(rgba, behind, k, light, before, after, c):
     return 0.5 * light * ((rgba[after, c] - rgba[before, c]) - opacity * behind[k, c])
 
 
+@compiled(inline="always")
+def _laid(rgba, n, light, out, y, x):
+    """Add a layer behind those of a cell in `out` (2, H, W, C); returns the light that passes."""
+    for c in range(rgba.shape[1]):
+        out[0, y, x, c] += light * rgba[n, c]
+    return light * (1 - rgba[n, rgba.shape[1] - 1])
+
+
 @loop
 def cells(first, last, rgba, row, out):
     """Fill lines `first` to `last` of `out` (2, H, W, C): composites, and zeros."""
-    alpha = rgba.shape[1] - 1
     out[:, first:last] = 0.0
     for y in range(first, last):
         for x in range(row.shape[2]):
             light = 1.0
             for k in range(len(row)):
-                n = row[k, y, x]
-                if n >= 0 and light > 0:
-                    for c in range(alpha + 1):
-                        out[0, y, x, c] += light * rgba[np.uint32(n), c]
-                    light *= 1 - rgba[np.uint32(n), alpha]
+                if row[k, y, x] >= 0 and light > 0:
+                    light = _laid(rgba, np.uint32(row[k, y, x]), light, out, y, x)
 
 
 @loop
@@ -115,13 +119,30 @@ def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
                     out[1, y, x, c] -= aside + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
 
 
-@compiled
+@compiled(inline="always")
 def _dot(rgba, n, g, half, y, x):
     """The product of a sample's colour and one half of the gradient (2, H, W, C) of a cell."""
     total = 0.0
     for c in range(rgba.shape[1]):
         total += rgba[n, c] * g[half, y, x, c]
     return total
+
+
+@compiled(inline="always")
+def _add(g_rgba, n, light, g, y, x):
+    """Add the gradient (2, H, W, C) of a cell to that of a layer's colour."""
+    for c in range(g_rgba.shape[1]):
+        g_rgba[n, c] += light * g[0, y, x, c]
+
+
+@compiled(inline="always")
+def _pulled(rgba, before, after, g, y, x, behind):
+    """The product of `_change`, without the light, and the gradient of a cell; given that of what is behind."""
+    opacity = rgba[after, rgba.shape[1] - 1] - rgba[before, rgba.shape[1] - 1]
+    change = 0.0
+    for c in range(rgba.shape[1]):
+        change += (rgba[after, c] - rgba[before, c]) * g[1, y, x, c]
+    return 0.5 * (change - opacity * behind)
 
 
 @loop
@@ -131,7 +152,7 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     The second half is what moves along the slopes of composites, which has a derivative alone.
     """
     most, height, width = row.shape
-    count, alpha = rgba.shape[1], rgba.shape[1] - 1
+    alpha = rgba.shape[1] - 1
     samples, layers, through = np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most)
     for y in range(height):
         for x in range(width):
@@ -141,24 +162,21 @@ def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
                 n, light = samples[k], through[k]
                 passed = 1 - rgba[n, alpha]
                 if len(g_rgba):
-                    for c in range(count):
-                        g_rgba[n, c] += light * g[0, y, x, c]
+                    _add(g_rgba, n, light, g, y, x)
                     g_rgba[n, alpha] -= light * behind
                     behind = _dot(rgba, n, g, 0, y, x) + passed * behind
                 if len(g_positions):
-                    for axis in range(2):
-                        before, after = _beside(row, joined, layers[k], y, x, axis)
-                        if before != after:
-                            change = _dot(rgba, after, g, 1, y, x) - _dot(rgba, before, g, 1, y, x)
-                            change -= (rgba[after, alpha] - rgba[before, alpha]) * moved_behind
-                            g_positions[n, axis] -= 0.5 * light * change
+                    left, right = _beside(row, joined, layers[k], y, x, 0)
+                    up, down = _beside(row, joined, layers[k], y, x, 1)
+                    g_positions[n, 0] -= light * _pulled(rgba, left, right, g, y, x, moved_behind)
+                    g_positions[n, 1] -= light * _pulled(rgba, up, down, g, y, x, moved_behind)
                     moved_behind = _dot(rgba, n, g, 1, y, x) + passed * moved_behind
 
 
 # ---------------------------------------------------------------------------------------------------- beside breaks
 
 
-@compiled
+@compiled(inline="always")
 def _color(rgba, n, c):
     """A channel of a sample; 0 for none."""
     return rgba[n, c] if n >= 0 else 0.0
@@ -199,7 +217,7 @@ def _weigh_side(b, i, rgba, row, cell, gap, rows, stack, normal, through, behind
             change[k, c] = through[k] * (rise - opacity * behind[k, c])
 
 
-@compiled
+@compiled(inline="always")
 def _cells_of(gap, place, b, i):
     """The cell on a side of a break and the one beyond, (y, x) each, and the share of a change that the first has."""
     y, x, right = gap[b, 0], gap[b, 1], gap[b, 2]

@@ -10,7 +10,7 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 
 
-@compiled
+@compiled(inline="always")
 def _beside(row, joined, y, x):
     """The samples of the next cells to the left and right, above and below; see `_slope`.
 
@@ -24,7 +24,7 @@ def _beside(row, joined, y, x):
     return left, right, above, below
 
 
-@compiled
+@compiled(inline="always")
 def _slope(rgba, before, after, c):
     """The slope of a channel at a cell: the mean of the differences from and to the next cells of the same surface."""
     return (rgba[after, c] - rgba[before, c]) / 2
@@ -92,32 +92,32 @@ def pull_inside(border, rgba, row, joined, g, g_positions, g_rgba):
                     g_positions[n, 1] -= _slope(rgba, above, below, c) * g[i, j, c]
 
 
-@compiled
+@compiled(inline="always")
 def _is_in(image, i, j):
     """True for a pixel of an image (h, w, C); its cells have a border around it."""
     return 0 <= i < image.shape[0] and 0 <= j < image.shape[1]
 
 
-@compiled
+@compiled(inline="always")
 def _of(rgba, n, c):
     """A channel of a sample; 0 where nothing is seen."""
     return rgba[n, c] if n >= 0 else 0.0
 
 
-@compiled
+@compiled(inline="always")
 def _add_to(g_rgba, n, c, value):
     """Add to the gradient of a sample's channel."""
     if n >= 0:
         g_rgba[n, c] += value
 
 
-@compiled
+@compiled(inline="always")
 def _jump(rgba, shown, b, c):
     """A channel before a break, less that behind."""
     return _of(rgba, shown[b, 0], c) - _of(rgba, shown[b, 1], c)
 
 
-@compiled
+@compiled(inline="always")
 def _last(s, ties, m, beyond):
     """The m-th of the breaks that pull at a segment: the one before, its own two, the one after; or −1."""
     if m == 0:
@@ -152,7 +152,7 @@ def motions(positions, rows, points, moves, out):
                     out[b, a] += moves[b, i, 0, a] * x + moves[b, i, 1, a] * y + moves[b, i, 2, a] * positions[n, 2]
 
 
-@compiled
+@compiled(inline="always")
 def _rates(s, k, ties, beyond, flux, motion):
     """The flux through a segment in its cell k, for each of its two jumps."""
     first, second = 0.0, 0.0
@@ -164,7 +164,7 @@ def _rates(s, k, ties, beyond, flux, motion):
     return first, second
 
 
-@compiled
+@compiled(inline="always")
 def _pull_rates(s, k, ties, beyond, flux, first, second, g_motion):
     """Add to gradients of motions those of `_rates`, given those of the two rates."""
     for m in range(4):
@@ -288,7 +288,7 @@ def pull_jumps(shown, g_jump, g_rgba):
                     g_rgba[n, c] += g_jump[b, c] if i == 0 else -g_jump[b, c]
 
 
-@compiled
+@compiled(inline="always")
 def _moved(positions, row, rows, points, sides, b, i, y, x):
     """The motion of the surface on a side of a break, by its last sample and that of the cell; see `weigh_sides`."""
     n, m = rows[b, i], row[y, x]

@@ -72,7 +72,7 @@ def in_use(near_ends, ties, beyond):
     return breaks, segments
 
 
-@compiled
+@compiled(inline="always")
 def _place(x, y, side):
     """A place on a square's sides, clockwise from the upper left corner, 0 to 4."""
     if side == 0:
@@ -82,21 +82,21 @@ def _place(x, y, side):
     return 3 - x if side == 2 else 4 - y
 
 
-@compiled
+@compiled(inline="always")
 def _next_side(side, k, is_first, is_last):
     """The side of a break, 0 or 1, that a square's corner is next to; −1 if another break lies between, or no gap."""
     begins, stops = is_first and k == (0, 1, 3, 0)[side], is_last and k == (1, 2, 2, 3)[side]
     return 0 if begins else (1 if stops else -1)
 
 
-@compiled
+@compiled(inline="always")
 def _point(place, x, y, along):
     """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
     x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
     return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
 
 
-@compiled
+@compiled(inline="always")
 def _at_hub(s, hub, rows):
     """Fill `rows` with a segment's own and those of segments that end at it, or cross it. Returns their number."""
     rows[0], count = s, 1
@@ -107,7 +107,16 @@ def _at_hub(s, hub, rows):
     return count
 
 
-@compiled
+@compiled(inline="always")
+def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
+    """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
+    for r in range(4):
+        rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
+        flux[s, k, i, r, 0] += rate * dy
+        flux[s, k, i, r, 1] -= rate * dx
+
+
+@compiled(inline="always")
 def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
     """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
 
@@ -149,15 +158,12 @@ def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
                 weight[n, k] += height * dx
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
-                    for r in range(4):
-                        rate = of_cell * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
-                        flux[s, k, i, r, 0] += (1 - 0.5 * t * abs(other)) * rate * dy
-                        flux[s, k, i, r, 1] -= (1 - 0.5 * t * abs(other)) * rate * dx
-                        flux[s, k, 1 - i, r, 0] -= 0.5 * t * other * sign * rate * dy
-                        flux[s, k, 1 - i, r, 1] += 0.5 * t * other * sign * rate * dx
+                    own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
+                    _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
+                    _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
 
 
-@compiled
+@compiled(inline="always")
 def _along(ax, ay, bx, by, x, y):
     """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
     dx, dy = bx - ax, by - ay
@@ -167,7 +173,7 @@ def _along(ax, ay, bx, by, x, y):
     return t, (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
 
 
-@compiled
+@compiled(inline="always")
 def _fill_path(path, s, place, gap, square, ties, corner):
     """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
     for e in range(2):
@@ -177,7 +183,7 @@ def _fill_path(path, s, place, gap, square, ties, corner):
     path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
 
 
-@compiled
+@compiled(inline="always")
 def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
     """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
 
@@ -199,7 +205,7 @@ def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
         rates[1, 1, r] = pull[h, r]
 
 
-@compiled
+@compiled(inline="always")
 def _next_breaks(k, count, sides, at):
     """The rays whose breaks come before and after a corner of a square, clockwise."""
     before, after = 0, 0
@@ -287,7 +293,7 @@ def weigh_segments(
                 lost[owners[before], k, i] = lost[owners[after], k, j] = own
 
 
-@compiled
+@compiled(inline="always")
 def fill_normals(gap, place, ties, normal):
     """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
     for b in range(len(gap)):
