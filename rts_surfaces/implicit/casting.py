@@ -18,7 +18,7 @@ from rts_surfaces.implicit.regions import Region
 Level = Callable[[Array], Array]
 Describe = Callable[[Array, Array], Array]
 
-STEPS, WITH_BOUND = 256, 512
+STEPS, WITH_BOUND = 256, 1024
 """The number of shortest steps across the region, without and with a Lipschitz constant."""
 
 SECANT, NEWTON = 5, 2
