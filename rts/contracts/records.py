@@ -234,8 +234,8 @@ class Outlines:
         square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
         hub: (S,) int32, how many rows farther on there is the segment, of the same square, that the outline of a lone
             break ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `beyond` has the
-            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is the motion of
-            that segment's corner.
+            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is about the motion
+            of that segment's corner. Lone breaks with no segment beside them have the first of them as their hub.
         beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
         corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
         pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum

@@ -113,7 +113,7 @@ class Breaks(NamedTuple):
         triangles: (B, 4) int32, the triangles of these samples, in order; −1 where none is known.
         tangent: (B, 2) float64, the outline's unit direction in the image, either way; 0 where it is unknown.
         cells_away: (B,) float64, how many cells, each as deep as it is wide, the surface that ends is away, but for a
-            constant; 0 where it is unknown.
+            constant; NaN where it is unknown.
     """
 
     gap: np.ndarray
@@ -227,8 +227,7 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
 def cells_away(depth: np.ndarray, width: np.ndarray) -> np.ndarray:
     """`Breaks.cells_away` (B,) at depths (B,); `width` as in `Oracle`."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        away = np.log(width[0] + width[1] * depth) / width[1] if width[1] > 0 else depth / width[0]
-    return np.where(np.isfinite(away), away, 0.0)
+        return np.log(width[0] + width[1] * depth) / width[1] if width[1] > 0 else depth / width[0]
 
 
 def lines_of_crossing(slope: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Breaks on the sides of a square of four centres, joined into segments that do not cross. Compiled."""
+"""Breaks on the sides of a square of four centres, joined into segments that do not cross within a part. Compiled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ counts for those `FAR` cells apart."""
 ON_FRONT = 1.0
 """How much farther off its way, in cells, an outline counts to end at a segment on the side of what this bounds."""
 
-
 FAR = 4.0
 """Cells along a ray, each as deep as it is wide; see `OTHER_DEPTH`."""
 
@@ -29,7 +28,6 @@ STRAIGHT = 1e-3
 
 CLOSE = 1e-4
 """Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
-
 
 ALIKE = 1e-6
 """Distance, in cells, of two breaks that are in one place."""
@@ -132,7 +130,8 @@ def _cost(a, b, ends, place, tangent, cells_away):
         cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
     cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
     apart = abs(cells_away[p] - cells_away[q])
-    return cost + OTHER_KIND * crosses + OTHER_DEPTH * apart / (apart + FAR)
+    cost += OTHER_DEPTH * apart / (apart + FAR) if apart > 0 else 0.0  # Unknown ones are NaN.
+    return cost + OTHER_KIND * crosses
 
 
 @compiled(inline="always")
@@ -280,9 +279,11 @@ def _angle(a, b):
 
 @compiled(inline="always")
 def _inward(tangent, side):
-    """A direction, turned into a square from one of its sides."""
+    """A direction, turned into a square from one of its sides; straight into it where the direction is unknown."""
     into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
     sign = 1.0 if into >= 0 else -1.0
+    if tangent[0] == 0 and tangent[1] == 0:
+        return (0.0, -1.0, 0.0, 1.0)[side], (1.0, 0.0, -1.0, 0.0)[side]
     return sign * tangent[0], sign * tangent[1]
 
 
@@ -309,9 +310,9 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2).
         square_sides: (S, 2), see `segments_of`.
-        around: (S, 4), the result of `beyond`.
+        around: (S, 4), the result of `_beyond`.
         place: (B, 2), x and y of breaks.
-        tangent: (B, 2), see `join`.
+        tangent: (B, 2), see `_join`.
         triangle: (B,) int64, the triangle that ends at each break, or −1.
         corner: to fill.
         pull: to fill.
@@ -469,16 +470,29 @@ def _hub(first, stop, s, way, origin, ties, place, around, hub, corner):
     return step, on
 
 
+@compiled(inline="always")
+def _where_both_end(s, other, origin, ties, square_sides, place, tangent):
+    """Where the outlines of two lone breaks of a square meet, from its first centre: ahead, or midway between both."""
+    start, end = _row(place, ties[s, 0]), _row(place, ties[other, 0])
+    way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
+    back = _inward(_row(tangent, ties[other, 0]), square_sides[other, 0])
+    point, between = _meeting(start, way, end, (-back[0], -back[1]))
+    if not (between and _within(point, origin, s)):
+        point = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
+    return point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
+
+
 @loop
 def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
     """Fill in `hub` (S,), and what else `Outlines` has of the segments with one; other arguments are as of `corners`.
 
-    A break that is alone ends at a segment of its square, which hides the rest of its outline. This goes on along its
-    tangent to the first segment that is there, or as near as one allows. Where light passes through, outlines cross.
-    `beyond` is (S, 4), the result of `_beyond`.
+    A lone break ends at a segment of its square, since what this bounds hides the rest. The outline goes on along its
+    tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone breaks
+    that have no segment beside them meet in a point. Where light passes through, outlines cross. `beyond` is (S, 4),
+    the result of `_beyond`.
     """
     count, first = len(ties), 0
-    around, on = np.zeros((count, 2)), np.zeros(count)
+    around, on, corner_of = np.zeros((count, 2)), np.zeros(count), np.zeros(count, np.int8)
     for s in range(count):
         for e in range(2):
             if ties[s, e] >= 0:
@@ -487,15 +501,36 @@ def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
         stop = first + 1
         while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
             stop += 1
-        for s in range(first, stop) if stop - first > 1 else range(0):
+        for s in range(first, stop):
             way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
             hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, around, hub, corner)
+        lead = -1
+        for s in range(first, stop):
+            if ties[s, 1] >= 0 or hub[s] != 0:
+                continue
+            if lead < 0:
+                lead = s
+            elif s - lead <= REACH and not _apart(first, stop, s, lead, ties, around):
+                if corner_of[lead] == 0:
+                    corner[lead, 0], corner[lead, 1] = _where_both_end(
+                        lead, s, origin, ties, square_sides, place, tangent
+                    )
+                corner_of[lead], hub[s] = 1, lead - s
         first = stop
     for s in range(count):
-        if hub[s] == 0 or hub[s + hub[s]] != 0:
-            hub[s] = 0  # What ends at another one, or crosses it, is no hub.
+        if hub[s] == 0:
             continue
-        other, e = s + hub[s], 0 if on[s] < 1 else 1
+        other = s + hub[s]
+        if hub[other] != 0:  # What crosses another one is no hub: that one is.
+            hub[s], on[s] = hub[s] + hub[other], on[other]
+            other = s + hub[s]
+            if abs(hub[s]) > REACH:
+                hub[s] = 0
+                continue
+        if ties[other, 1] < 0:
+            corner[s] = corner[other]
+            continue
+        e = 0 if on[s] < 1 else 1
         share = on[s] if e == 0 else 2 - on[s]
         end, middle = _on_segment(origin, other, e, ties, place, corner)
         for a in range(2):

@@ -87,7 +87,7 @@ def moving_edges(
     """
     from rts.outlines import silhouettes_loops
 
-    slope, depth, tangent = np.zeros((len(near), 2, 2)), np.zeros(len(near)), np.zeros((len(near), 2))
+    slope, depth, tangent = np.zeros((len(near), 2, 2)), np.full(len(near), np.nan), np.zeros((len(near), 2))
     known = read_only(parts), read_only(triangles), read_only(points)
     for sheet in sheets:
         sheet.edges(near, *known, slope, depth, tangent)

@@ -1,4 +1,4 @@
-"""Points where three outlines meet: an edge that ends behind another surface. Closed forms of polygons."""
+"""Points where outlines meet: edges that end behind another surface, panes that cross. Closed forms of polygons."""
 
 import numpy as np
 import pytest
@@ -112,3 +112,14 @@ def test_cards_side_by_side_leave_no_trace_of_their_seam(seam):
     shares = np.stack([covered(np.array(corners), SIZE) for corners in (left, right)], axis=-1)
     np.testing.assert_allclose(image[..., :2], shares, atol=2e-3)
     np.testing.assert_allclose(image[..., 3], shares.sum(-1), atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_colours_of_heaps_of_cards_stay_in_range(seed):
+    random, parts = np.random.default_rng(seed), []
+    for _ in range(30):
+        corners = turned(SQUARE * random.uniform(0.2, 0.8, 2), random.uniform(0, 3), random.uniform(2, 22, 2))
+        vertices = flat(corners, 3.0) - np.float32([0, 0, 1]) * random.uniform(0, 4, (4, 1)).astype(np.float32)
+        parts.append(card(vertices, random.random(3)))
+    image = rts.render(parts, in_pixels(), SIZE)
+    assert image.min() >= -1e-5 and image.max() <= 1 + 1e-5

@@ -1,15 +1,18 @@
 """The rule of found edges in array code: pixels are area averages beside straight edges, which move with samples.
 
-    image of a pixel  =  C − ∇C · m  +  Σ over segments of  (share beside the segment − share of the centre) · J
-                                     +  Σ over segments of  ∫ v · n J ds
+    image of a pixel  =  C − ∇C · m  +  Σ over rays of  (mean share of the rays that it meets − its own share) · J
+                                     +  Σ over rays of  ∫ v · n J ds
 
     C       the colour of the centre's sample; ∇C its slope across the image, from the next centres on the same surface
     m       the motion of this sample in the image: 0 in value, it has the derivative
-    J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks;
-            in the shares, on the side of the cell's own surface, the colour C
-    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there, or
-            the mean of a pair of samples beside the deepest point of its ray
-    n ds    along the part of the segment inside the pixel
+    ray     an outline from a break on the side of a square to the point inside where it meets others
+    share   of the pixel's quarter in the square, what the ray leaves on one side of it; between two rays lies the
+            difference of both. Jumps around a point add up to 0, and the mean takes off what they miss it by
+    J       the colour on one side of a break less that on the other, from the last samples beside it; in the shares, on
+            the side of the cell's own surface, the colour C
+    v       the motion of a break, linear to that of the point: that of the last sample of the surface that ends there,
+            or the mean of a pair of samples beside the deepest point of its ray
+    n ds    along the part of the ray inside the pixel
 
 Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
 and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the flux, J are constants.
@@ -147,8 +150,7 @@ class _Breaks(NamedTuple):
 class _Rays(NamedTuple):
     """Outlines from breaks on the sides of squares to points inside, where they meet: R = 2 S, of all starts and ends.
 
-    A ray leads to the corner of its segment, or of the one that this ends at or crosses. The outline of a lone break
-    ends alone.
+    A ray leads to the corner of its segment, or of the one that this ends at or crosses, its leader.
 
     Attributes:
         square: (R, 2) int, x and y of the first corner's cell.
@@ -188,7 +190,10 @@ class _Rays(NamedTuple):
         side = xp.concat([sides[:, 0], xp.where(lone, sides[:, 0], sides[:, 1])])
         square = xp.stack([outlines.square[:, 1], outlines.square[:, 0]], axis=-1)
         twice = xp.concat([square, square])
-        start = xp.clip(xp.take(breaks.place, ties, axis=0) - xp.astype(twice, breaks.place.dtype) - 0.5, 0.0, 1.0)
+        gap, along = (xp.take(x, ties, axis=0) for x in (outlines.gap, breaks.step))
+        first = xp.stack([gap[:, 1] - twice[:, 0], gap[:, 0] - twice[:, 1]], axis=-1)
+        start = xp.take(outlines.place, ties)[:, None] * along + xp.astype(first, along.dtype)
+        start = xp.clip(start, 0.0, 1.0)
         x, y = start[:, 0], start[:, 1]
         place = xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y)))
         before, behind = (xp.take(color, ties, axis=0) for color in (breaks.color[0], breaks.color[1]))
@@ -197,8 +202,8 @@ class _Rays(NamedTuple):
         firsts, lasts = (xp.take(outlines.ends[:, i], ties) for i in (0, 1))
         seen = xp.stack([xp.take(breaks.seen[k], ties) for k in (0, 1)], axis=-1)
         same = (outlines.ties[:, 0] == outlines.ties[:, 1]) & ~lone
-        group, alone, hub = _grouped(outlines, ~same, ~same & ~lone)
-        points, moves = _ways(outlines, breaks, ties, start, hub)
+        group, alone, leader = _grouped(outlines, ~same, ~same & ~lone)
+        points, moves = _ways(outlines, breaks, ties, start, leader)
         # The two jumps of a segment at which no other ends go over into one another.
         jump, (count, half) = before - after, (lone.shape[0], (alone & ~lone)[:, None])
         mean = (jump[:count, ...] - jump[count:, ...]) / 2
@@ -207,7 +212,7 @@ class _Rays(NamedTuple):
             twice,
             xp.concat([~same, ~same & ~lone]),
             group,
-            xp.concat([hub, hub]),
+            xp.concat([leader, leader]),
             side,
             place,
             points,
@@ -297,20 +302,20 @@ def _grouped(outlines: Outlines, start: Array, end: Array) -> tuple[tuple[Array,
 
 
 def _ways(
-    outlines: Outlines, breaks: _Breaks, ties: Array, start: Array, hub: Array
+    outlines: Outlines, breaks: _Breaks, ties: Array, start: Array, leader: Array
 ) -> tuple[Array, Sequence[Sequence[Array]]]:
     """`_Rays.points` and `_Rays.moves`, given the breaks and points (R, ...) where rays start, and their `leader` (S,).
 
     A ray runs along the segment that its own one ends at, from where it meets that, and moves there as that does.
     """
-    xp, count, alone = namespace(start), hub.shape[0], (outlines.hub == 0)[:, None]
+    xp, count, alone = namespace(start), leader.shape[0], (outlines.hub == 0)[:, None]
     corner, own = outlines.corner, [xp.take(breaks.moves, x, axis=0) for x in (ties[:count], ties[count:])]
     beyond = [
         xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0) for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
     ]
     at_corner = sum(outlines.pull[:, i, None] * x for i, x in enumerate((beyond[0], own[0], own[1], beyond[1])))
     path = [start[:count, ...], corner, start[count:, ...]]
-    others = [xp.take(x, hub, axis=0) for x in path]
+    others = [xp.take(x, leader, axis=0) for x in path]
     (first, near), (second, far) = (_along(others[i], others[1], corner) for i in (0, 2))
     t, along = xp.where(near <= far, first, second)[:, None], xp.where((near <= far)[:, None], *beyond)
     share = _along(path[0], path[2], corner)[0][:, None]

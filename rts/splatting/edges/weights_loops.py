@@ -120,6 +120,8 @@ def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
 def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
     """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
 
+    Returns the place of the break on the sides.
+
     Args:
         flux: see `weigh_segments`; filled in for segment s and jump i.
         weight: (N, 4), to fill row n: by how much the colours of the cells' quarters rise with the jump, clockwise.
@@ -130,8 +132,7 @@ def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
         border: see `weigh_segments`.
         ray: (3, 2), the break, a point between, and where the outlines meet.
         rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
-        other: 1 or −1 if the jump goes over to the mean of both of the segment's, and the other one has this sign; else
-            0.
+        other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
     """
     sign, start = 1.0 if side < 2 else -1.0, _place(ray[0, 0], ray[0, 1], side)
     for k in range(4):
@@ -161,6 +162,7 @@ def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
                     own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
                     _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
                     _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
+    return start
 
 
 @compiled(inline="always")
@@ -225,7 +227,7 @@ def weigh_segments(
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
     From each break on a square's sides an outline goes to a point inside, the corner of its segment, or of the one that
-    this ends at. Between the breaks that meet there lie as many surfaces.
+    this ends at or crosses. Between the breaks that meet there lie as many surfaces.
 
     Args:
         first: the first segment.
@@ -257,7 +259,7 @@ def weigh_segments(
             share[s], cell_side[s], lost[s], flux[s] = 0.0, -1, 0.0, 0.0
             continue
         if hub[s] != 0:
-            continue  # Its weights are filled in with those of that segment.
+            continue  # Its weights are filled in with those of that segment, which has no hub.
         _fill_path(of_hub, s, place, gap, square, ties, corner)
         total, count = _at_hub(s, hub, rows), 0
         both = total == 1 and ties[s, 1] >= 0
@@ -270,8 +272,8 @@ def weigh_segments(
                 if both:
                     other = 1.0 if square_sides[h, 1 - e] < 2 else -1.0
                 _fill_ray(s, h, e, of_hub, path, pull, ray, rates)
-                _weigh_ray(flux, weight, h, e, count, side, border, ray, rates, other)
-                owners[count], jumps[count], sides[count], at[count] = h, e, side, _place(ray[0, 0], ray[0, 1], side)
+                at[count] = _weigh_ray(flux, weight, h, e, count, side, border, ray, rates, other)
+                owners[count], jumps[count], sides[count] = h, e, side
                 count += 1
         for k in range(4):
             # Jumps around a point add up to 0; those of colours that change along outlines hardly miss it.
