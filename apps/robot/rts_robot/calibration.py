@@ -22,7 +22,7 @@ COARSE, MIDDLE, FULL = rts.Stage(1 / 8, 2, 2.0), rts.Stage(1 / 4), rts.Stage()
 """Stages of a fit: that of each start, and those of the best."""
 TRIES, FOUND = 4, 0.55
 """The most searches for a start, each with a seed of its own; and the mean IoU above which none follows."""
-LIMITS = {COARSE: (3e-3, 20), MIDDLE: (1e-3, 20), FULL: (1e-5, 8)}
+LIMITS = {COARSE: (3e-3, 20), MIDDLE: (1e-3, 20), FULL: (1e-5, 40)}
 """For each stage, the least gain of a step, as a share of the loss, which is mostly that of wrong pixels; and the most
 steps. Further ones moved the camera by less than a tenth of its standard deviation."""
 AXES = np.diag([1.0, -1.0, -1.0, 1.0])
