@@ -216,7 +216,7 @@ LOOPS = [
     Defect(
         "outlines of glass do not cross",
         "rts/outlines/segments_loops.py",
-        "crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)",
+        "crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)",
         "crosses = False",
         "edges_meetings",
     ),

@@ -46,11 +46,11 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     order = np.argsort(group + 1j * along, kind="stable")  # By both parts, and faster than lexsort.
     known = breaks.place, breaks.tangent
     of_breaks = *known, breaks.cells_away
-    origin, ties, square_sides, around = loops.segments_of(order, group, square, ends, *of_breaks, size[1])
+    origin, ties, square_sides, neighbours = loops.segments_of(order, group, square, ends, *of_breaks, size[1])
     triangle = loops.ending(breaks.near, breaks.parts, breaks.triangles)
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
-    filled = origin, ties, square_sides, around, *known, triangle, corner, pull
+    filled = origin, ties, square_sides, neighbours, *known, triangle, corner, pull
     parallel(loops.corners, len(ties), *filled, work=150 * len(ties))
     hub = np.zeros(len(ties), np.int32)
-    loops.meet(origin, ties, square_sides, *known, hub, corner, pull, around)
-    return Segments(origin, ties, square_sides, hub, np.ascontiguousarray(around[:, 1:3]), corner, pull)
+    loops.meet(origin, ties, square_sides, *known, hub, corner, pull, neighbours)
+    return Segments(origin, ties, square_sides, hub, np.ascontiguousarray(neighbours[:, 1:3]), corner, pull)

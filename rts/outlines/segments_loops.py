@@ -36,6 +36,15 @@ MOST_ALIKE = 4
 """The most breaks in one place: a centre is the end of so many gaps."""
 
 
+@compiled(inline="always")
+def on_sides(x, y, side):
+    """The place on a square's sides, clockwise from the upper left corner, 0 to 4, of a point on one of its sides.
+
+    Sides are 0 at the top, 1 right, 2 at the bottom, 3 left; `x` and `y` count from the upper left corner.
+    """
+    return x if side == 0 else (1 + y if side == 1 else (3 - x if side == 2 else 4 - y))
+
+
 @loop
 def ends_of(gap, place, near, parts, height, width):
     """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
@@ -65,7 +74,7 @@ def ends_of(gap, place, near, parts, height, width):
                 continue
             side = (2 if row == 1 else 1) if first == 0 else (0 if row == 1 else 3)
             square[count] = top * width + left
-            along[count] = at if side == 0 else (1 + at if side == 1 else (3 - at if side == 2 else 4 - at))
+            along[count] = on_sides(at, at, side)
             sign = 0 if near[b] == 2 else (1 if near[b] == 0 else -1)
             ends[count, 0], ends[count, 1], ends[count, 2] = b, side, sign if side < 2 else -sign
             ends[count, 3], ends[count, 4] = front, back
@@ -168,7 +177,7 @@ def segments_of(order, group, square, ends, place, tangent, cells_away, width):
         width: number of centres in a line.
 
     Returns:
-        First corners (S, 2) of squares, ties (S, 2) and sides (S, 2), int32; and `_beyond` of these.
+        First corners (S, 2) of squares, ties (S, 2) and sides (S, 2), int32; and `_neighbours` of these.
     """
     count = len(order)
     begins, several, sorted_ends = np.empty(count + 1, np.int64), 0, np.empty((count, 5), np.int32)
@@ -197,7 +206,7 @@ def segments_of(order, group, square, ends, place, tangent, cells_away, width):
             ties[found, 1], square_sides[found, 1] = sorted_ends[other, 0], sorted_ends[other, 1]
         found += 1
     ties = ties[:found]
-    return origin[:found], ties, square_sides[:found], _beyond(ties, place)
+    return origin[:found], ties, square_sides[:found], _neighbours(ties, place)
 
 
 @loop
@@ -214,7 +223,7 @@ def ending(near, parts, triangles):
 
 
 @compiled(inline="always")
-def _beyond(ties, place):
+def _neighbours(ties, place):
     """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
 
     Of breaks in one place, which an outline has that passes through a centre, one counts. `ties` (S, 2) are the ends of
@@ -295,7 +304,7 @@ def _within(point, origin, s):
 
 
 @loop
-def corners(first, last, origin, ties, square_sides, around, place, tangent, triangle, corner, pull):
+def corners(first, last, origin, ties, square_sides, neighbours, place, tangent, triangle, corner, pull):
     """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
@@ -310,7 +319,7 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2).
         square_sides: (S, 2), see `segments_of`.
-        around: (S, 4), the result of `_beyond`.
+        neighbours: (S, 4), the result of `_neighbours`.
         place: (B, 2), x and y of breaks.
         tangent: (B, 2), see `_join`.
         triangle: (B,) int64, the triangle that ends at each break, or −1.
@@ -333,8 +342,8 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
             share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
             if tip:
                 x, y = x + share * (curve[0] - x), y + share * (curve[1] - y)
-        if around[s, 1] >= 0 and around[s, 2] >= 0:
-            before, after = _row(place, around[s, 1]), _row(place, around[s, 2])
+        if neighbours[s, 1] >= 0 and neighbours[s, 2] >= 0:
+            before, after = _row(place, neighbours[s, 1]), _row(place, neighbours[s, 2])
             curve, between = _meeting(start, _minus(end, before), end, _minus(after, start))
             if not tip and between and _within(curve, origin, s):
                 x, y = x + 2 / 3 * (curve[0] - x), y + 2 / 3 * (curve[1] - y)
@@ -342,10 +351,10 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
             sharp, between = _meeting(start, ahead, end, behind)
             if between and _within(sharp, origin, s):
                 beside = 0.0
-                if around[s, 0] >= 0:
-                    beside += _angle(_minus(before, _row(place, around[s, 0])), ahead)
-                if around[s, 3] >= 0:
-                    beside += _angle(behind, _minus(_row(place, around[s, 3]), after))
+                if neighbours[s, 0] >= 0:
+                    beside += _angle(_minus(before, _row(place, neighbours[s, 0])), ahead)
+                if neighbours[s, 3] >= 0:
+                    beside += _angle(behind, _minus(_row(place, neighbours[s, 3]), after))
                 alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
             if alone > 0:
                 x, y = x + alone * (sharp[0] - x), y + alone * (sharp[1] - y)
@@ -380,13 +389,6 @@ def _towards(start, way, a, b):
 
 
 @compiled(inline="always")
-def _around(point, origin, s, side):
-    """A place on the sides of a segment's square, clockwise from the upper left corner, 0 to 4."""
-    x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
-    return x if side == 0 else (1 + y if side == 1 else (3 - x if side == 2 else 4 - y))
-
-
-@compiled(inline="always")
 def _between(at, start, end):
     """True if a place on the sides of a square comes after `start` and before `end`, clockwise."""
     return start < at < end if start < end else at > start or at < end
@@ -401,7 +403,7 @@ def _on_segment(origin, s, e, ties, place, corner):
 
 
 @compiled(inline="always")
-def _end_at(s, other, way, origin, ties, place, around, corner):
+def _end_at(s, other, way, origin, ties, place, clock, corner):
     """Where the outline of the lone break of a segment would end at another one; see `meet`.
 
     Returns:
@@ -415,17 +417,17 @@ def _end_at(s, other, way, origin, ties, place, around, corner):
         if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
             best, least, nearest = t if e == 0 else 2 - t, off, ahead
     # What the other segment bounds lies on the right of its way, and hides what is behind on its left.
-    hidden = _between(around[s, 0], around[other, 0], around[other, 1])
+    hidden = _between(clock[s, 0], clock[other, 0], clock[other, 1])
     return best, least + (0.0 if hidden else ON_FRONT), nearest
 
 
 @compiled(inline="always")
-def _apart(first, stop, s, other, ties, around):
+def _apart(first, stop, s, other, ties, clock):
     """True if a segment of the same square lies between the start of s and another one."""
-    at, found = around[s, 0], False
+    at, found = clock[s, 0], False
     for c in range(first, stop):
-        low, high = min(around[c, 0], around[c, 1]), max(around[c, 0], around[c, 1])
-        inside = low <= min(around[other, 0], around[other, 1]) and max(around[other, 0], around[other, 1]) <= high
+        low, high = min(clock[c, 0], clock[c, 1]), max(clock[c, 0], clock[c, 1])
+        inside = low <= min(clock[other, 0], clock[other, 1]) and max(clock[other, 0], clock[other, 1]) <= high
         between = (at < low or at > high) if inside else low < at < high
         found |= between and c != other and ties[c, 1] >= 0
     return found
@@ -450,20 +452,20 @@ def _crossing(s, other, origin, ties, place, corner):
 
 
 @compiled(inline="always")
-def _hub(first, stop, s, way, origin, ties, place, around, hub, corner):
+def _hub(first, stop, s, way, origin, ties, place, clock, hub, corner):
     """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
     step, on, least, nearest = 0, 0.0, np.inf, np.inf
     for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
         if ties[other, 1] < 0 or other == s:
             continue
         if ties[s, 1] < 0:
-            t, off, ahead = _end_at(s, other, way, origin, ties, place, around, corner)
+            t, off, ahead = _end_at(s, other, way, origin, ties, place, clock, corner)
             nearer = off < least - ALIKE or (off < least + ALIKE and ahead < nearest)
-            if nearer and not _apart(first, stop, s, other, ties, around):
+            if nearer and not _apart(first, stop, s, other, ties, clock):
                 step, on, least, nearest = other - s, t, off, ahead
             continue
-        low, high = min(around[other, 0], around[other, 1]), max(around[other, 0], around[other, 1])
-        crosses = (low < around[s, 0] < high) != (low < around[s, 1] < high)
+        low, high = min(clock[other, 0], clock[other, 1]), max(clock[other, 0], clock[other, 1])
+        crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)
         if crosses and other < s and step == 0 and hub[other] == 0:
             on = _crossing(s, other, origin, ties, place, corner)
             step = other - s if on >= 0 else 0
@@ -483,39 +485,40 @@ def _where_both_end(s, other, origin, ties, square_sides, place, tangent):
 
 
 @loop
-def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
+def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, neighbours):
     """Fill in `hub` (S,), and what else `Outlines` has of the segments with one; other arguments are as of `corners`.
 
     A lone break ends at a segment of its square, since what this bounds hides the rest. The outline goes on along its
     tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone breaks
-    that have no segment beside them meet in a point. Where light passes through, outlines cross. `beyond` is (S, 4),
-    the result of `_beyond`.
+    that have no segment beside them meet in a point. Where light passes through, outlines cross.
     """
     count, first = len(ties), 0
-    around, on, corner_of = np.zeros((count, 2)), np.zeros(count), np.zeros(count, np.int8)
+    # Where segments end on the sides of their squares, see `on_sides`.
+    clock, on = np.zeros((count, 2)), np.zeros(count)
     for s in range(count):
         for e in range(2):
             if ties[s, e] >= 0:
-                around[s, e] = _around(_row(place, ties[s, e]), origin, s, square_sides[s, e])
+                x, y = _row(place, ties[s, e])
+                clock[s, e] = on_sides(x - origin[s, 1] - 0.5, y - origin[s, 0] - 0.5, square_sides[s, e])
     while first < count:
         stop = first + 1
         while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
             stop += 1
         for s in range(first, stop):
             way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
-            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, around, hub, corner)
-        lead = -1
+            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, clock, hub, corner)
+        lead, alone = -1, True
         for s in range(first, stop):
             if ties[s, 1] >= 0 or hub[s] != 0:
                 continue
             if lead < 0:
                 lead = s
-            elif s - lead <= REACH and not _apart(first, stop, s, lead, ties, around):
-                if corner_of[lead] == 0:
+            elif s - lead <= REACH and not _apart(first, stop, s, lead, ties, clock):
+                if alone:
                     corner[lead, 0], corner[lead, 1] = _where_both_end(
                         lead, s, origin, ties, square_sides, place, tangent
                     )
-                corner_of[lead], hub[s] = 1, lead - s
+                alone, hub[s] = False, lead - s
         first = stop
     for s in range(count):
         if hub[s] == 0:
@@ -535,6 +538,6 @@ def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, beyond):
         end, middle = _on_segment(origin, other, e, ties, place, corner)
         for a in range(2):
             corner[s, a] = min(max((1 - share) * end[a] + share * middle[a], 0.0), 1.0)
-            beyond[s, 1 + a] = ties[other, a]
+            neighbours[s, 1 + a] = ties[other, a]
         pull[s, 0], pull[s, 3] = pull[other, 0] + pull[other, 1], pull[other, 2] + pull[other, 3]
         pull[s, 1], pull[s, 2] = 0.0, 0.0
