@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
-from rts.plugin_api.arrays import Array, Tree, exemplar, shape_of
+from rts.plugin_api.arrays import Array, Tree, dot, exemplar, shape_of
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
@@ -160,6 +160,7 @@ class Mesh(TriangleSurface):
         """Interpolated positions and attributes; see the class for their names."""
         vertices = with_room(theta["vertices"])
         gbuffer = GBuffer(position=self._interpolate(vertices, samples, 0))
+        gbuffer.defer("face_normal", partial(_face_normals, vertices, samples, gbuffer))
         for name in self._attributes(theta):
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
@@ -190,3 +191,12 @@ class Mesh(TriangleSurface):
         if kept is None or kept[0] != key:
             kept = self._normals = (key, vertex_normals(vertices, self.faces))
         return kept[1]
+
+
+def _face_normals(vertices: Array, samples: Samples, gbuffer: GBuffer) -> Array:
+    """Normals (N, 3) of the triangles that samples are on, on the side of their "normal"; without derivative."""
+    engine = engine_of(vertices, samples.ids)
+    xp, vertices, normal = engine.namespace, engine.stop_gradient(vertices), engine.stop_gradient(gbuffer["normal"])
+    a, b, c = (take(vertices, samples.ids[:, i]) for i in range(3))
+    face = xp.linalg.cross(b - a, c - a)
+    return face * xp.sign(dot(face, normal))

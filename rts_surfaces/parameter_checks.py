@@ -12,7 +12,7 @@ G_BUFFER_NAMES = {"normals": "normal", "colors": "color", "tangents": "tangent"}
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "tangents": (4,), "uv": (2,), "colors": (1, 3, 4)}
 """Entry of θ → how many numbers a vertex or control point may have in it."""
 
-RESERVED = ("vertices", "points", "position", "normal")
+RESERVED = ("vertices", "points", "position", "normal", "face_normal")
 """Names that attributes declared by users may not have."""
 
 

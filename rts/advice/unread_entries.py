@@ -26,7 +26,7 @@ SHADER_ENTRIES = (
 OF_MAPS = frozenset(map(own_uv, MAPS))
 """Attributes that are coordinates of single maps."""
 
-ATTRIBUTES = ("position", "normal", "uv", TANGENT, FOOTPRINT, *OF_MAPS)
+ATTRIBUTES = ("position", "normal", "face_normal", "uv", TANGENT, FOOTPRINT, *OF_MAPS)
 """Names that are attributes of the G-buffer only; "color" may be an entry of θ, too."""
 
 ALIKE = 0.8

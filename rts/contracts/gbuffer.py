@@ -14,11 +14,14 @@ class GBuffer(dict):
 
     Surfaces return attributes in local space; shaders receive positions and normals in world space. An attribute may be
     deferred: it is computed when first read, as `gbuffer[name]`, so a shader pays for what it reads. Reading a missing
-    attribute raises an `InputError`. Built-in surfaces use the names position, normal, uv and color. If there is "uv",
+    attribute raises an `InputError`.
+
+    Built-in surfaces use the names position, normal, uv and color. Meshes, whose normals are interpolated, also give
+    "face_normal" (N, 3), that of the triangle on the same side, of any length; without derivative. If there is "uv",
     shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
-    ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent"
-    (N, 4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal
-    × tangent. Coordinates of normal maps alone, "uv_normal_map", take the place of "uv" there.
+    ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent" (N,
+    4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal ×
+    tangent. Coordinates of normal maps alone, "uv_normal_map", take the place of "uv" there.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):

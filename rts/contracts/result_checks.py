@@ -17,7 +17,7 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
 
-WIDTHS = {"position": 3, "normal": 3, "tangent": 4, "uv": 2, "uv_footprint": 4}
+WIDTHS = {"position": 3, "normal": 3, "face_normal": 3, "tangent": 4, "uv": 2, "uv_footprint": 4}
 """Columns of attributes that the library itself reads."""
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from rts.arrays.array_functions import kind_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import Context, is_constant
+from rts.arrays.engines import Context, is_constant, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
@@ -221,6 +221,8 @@ def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBu
     world.defer("position", lambda: moves.points(gbuffer["position"]))
     if "normal" in gbuffer:
         world.defer("normal", lambda: moves.normals(gbuffer["normal"]))
+    if "face_normal" in gbuffer:
+        world.defer("face_normal", lambda: stopped(moves).normals(gbuffer["face_normal"]))
     if TANGENT in gbuffer:
         world.defer(TANGENT, lambda: moves.tangents(gbuffer[TANGENT]))
     return world

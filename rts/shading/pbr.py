@@ -57,7 +57,7 @@ class Pbr(Unlit):
 
     samplers: tuple[tuple[str, Wrap, str], ...] = ()
     takes_views = True
-    reads = "normal", "color", "uv", "texture", "light", TANGENT, *MAPS, *map(own_uv, MAPS)
+    reads = "normal", "face_normal", "color", "uv", "texture", "light", TANGENT, *MAPS, *map(own_uv, MAPS)
 
     def __post_init__(self):
         super().__post_init__()

@@ -183,10 +183,10 @@ class Textured(Unlit):
 
 @dataclass(frozen=True)
 class Lambert(Unlit):
-    """Diffuse shading, two-sided: normals are turned towards the viewer."""
+    """Diffuse shading, two-sided: normals are those of the side that is seen."""
 
     takes_views = True
-    reads = ("normal", "color", "uv", "texture", "light")
+    reads = ("normal", "face_normal", "color", "uv", "texture", "light")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -206,7 +206,7 @@ class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
     takes_views = True
-    reads = ("normal", "color", "uv", "texture", "light", "specular", "shininess")
+    reads = ("normal", "face_normal", "color", "uv", "texture", "light", "specular", "shininess")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -228,14 +228,21 @@ class BlinnPhong(Unlit):
 
 
 def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array, Array]:
-    """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
+    """Unit normals (N, 3) on the side that the viewer sees, and unit vectors (N, 3) towards the viewer; world space.
+
+    Normals that are interpolated over a triangle may still turn away from the viewer; see `is_behind`.
+    """
     normal, toward = gbuffer.unit("normal"), unit(camera.toward(gbuffer["position"]))
-    return namespace(normal).where(dot(normal, toward) < 0, -normal, normal), toward
+    return namespace(normal).where(is_behind(gbuffer, camera), -normal, normal), toward
 
 
 def is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
-    """(N, 1) bool, true where a sample's normal points away from the viewer; without derivative."""
-    arrays = gbuffer["position"], gbuffer["normal"], camera
+    """(N, 1) bool, true where the viewer sees the side of a surface that normals point away from; without derivative.
+
+    Near the outlines of a mesh, normals that are interpolated over a triangle turn away before the triangle does. So
+    "face_normal" tells which side is seen, if there is one.
+    """
+    arrays = gbuffer["position"], gbuffer["face_normal" if "face_normal" in gbuffer else "normal"], camera
     engine = engine_of(arrays)
     position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)
     return dot(normal, camera.toward(position)) < 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, FRONT, TORCH, arrays, gradient, mesh_part, moved, quad, rigid, show, to_numpy
 
-from rts import Camera, GBuffer, InputError
+from rts import Camera, GBuffer, InputError, Mesh, Part, render
 from rts.shading.shaders import BlinnPhong, Depth, Lambert, Normals, Silhouette, Unlit, sample_texture
 
 pytestmark = pytest.mark.rendering
@@ -153,6 +153,38 @@ def test_lambert_is_ambient_plus_diffuse_times_the_cosine(degrees):
 def test_lambert_is_two_sided_and_dark_where_light_comes_from_behind():
     np.testing.assert_allclose(shade(Lambert(), (0, 0, -2), light=light()), shade(Lambert(), light=light()))
     np.testing.assert_allclose(shade(Lambert(), light=light(180))[:3], 0.1)
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("shader", ["lambert", "blinn_phong", "pbr"])
+def test_interpolated_normals_that_turn_away_before_their_triangle_stay_on_its_side(target, shader):
+    # The triangle is seen at 80°, its normals lean 20° further: beyond the horizon.
+    a, b = math.radians(80), math.radians(100)
+    along, normal = np.array([math.cos(a), 0, -math.sin(a)]), np.array([math.sin(b), 0, math.cos(b)])
+    corners = 4 * np.array([-2 * along - (0, 2, 0), 2 * along - (0, 2, 0), (0, 2, 0)])
+    theta = {"vertices": corners, "normals": np.tile(normal, (3, 1)), "color": np.array([0.8, 0.4, 0.2])}
+    theta |= {"light": {"direction": np.array([1.0, 0, 0]), "color": np.ones(3), "ambient": np.array(0.125)}}
+    if shader == "blinn_phong":
+        theta["specular"] = np.zeros(3)
+    camera, mirror = Camera.orthographic((0, 0, 20), (0, 0, 0), height=1, near=1, far=40), np.diag([1.0, -1, 1, 1])
+
+    def seen(faces, transform=None, by=camera):
+        part = Part(Mesh(np.array([faces])), arrays(target, theta), shader, transform=transform)
+        return to_numpy(render(part, by, (3, 3)))[1, 1]
+
+    expected = seen((0, 1, 2))
+    assert expected[3] == 1
+    if shader != "pbr":
+        np.testing.assert_allclose(expected[:3], theta["color"] * (0.125 + math.sin(b)), rtol=1e-5)
+    for faces in (0, 1, 2), (2, 1, 0):
+        for transform in None, arrays(target, np.eye(4)), arrays(target, mirror):
+            np.testing.assert_allclose(seen(faces, transform), expected, rtol=1e-5)
+    # From behind, its other side is seen, in the dark.
+    behind = Camera.orthographic((0, 0, -20), (0, 0, 0), height=1, near=1, far=40)
+    dark = seen((0, 1, 2), by=behind)[:3]
+    assert (dark < 0.2 * expected[:3]).all()
+    if shader != "pbr":
+        np.testing.assert_allclose(dark, 0.125 * theta["color"], rtol=1e-5)
 
 
 def test_lambert_adds_several_lights_and_is_as_bright_as_they_are():
