@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
-from rts.plugin_api.arrays import Array, Tree, dot, exemplar, shape_of
+from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, exemplar, shape_of
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
@@ -194,9 +194,10 @@ class Mesh(TriangleSurface):
 
 
 def _face_normals(vertices: Array, samples: Samples, gbuffer: GBuffer) -> Array:
-    """Normals (N, 3) of the triangles that samples are on, on the side of their "normal"; without derivative."""
-    engine = engine_of(vertices, samples.ids)
-    xp, vertices, normal = engine.namespace, engine.stop_gradient(vertices), engine.stop_gradient(gbuffer["normal"])
+    """Normals (N, 3) of the triangles that samples are on, of any length, on the side of their "normal"."""
+    xp, normal = namespace(vertices, samples.ids), gbuffer["normal"]
     a, b, c = (take(vertices, samples.ids[:, i]) for i in range(3))
     face = xp.linalg.cross(b - a, c - a)
-    return face * xp.sign(dot(face, normal))
+    # NumPy takes ten times as long to sum along short axes.
+    inward = sum(face[:, i : i + 1] * normal[:, i : i + 1] for i in range(3)) < 0
+    return xp.where(inward, -face, face)

@@ -188,8 +188,8 @@ LOOPS = [
     Defect(
         "the lower side of a square is counted from the left",
         "rts/outlines/segments_loops.py",
-        "(3 - at if side == 2 else 4 - at)",
-        "(2 + at if side == 2 else 4 - at)",
+        "(3 - x if side == 2 else 4 - y)",
+        "(2 + x if side == 2 else 4 - y)",
         "segments edges edges_soups",
     ),
     Defect(

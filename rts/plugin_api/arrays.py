@@ -1,6 +1,6 @@
 """Arrays of any engine, and trees of them."""
 
-from rts.arrays.array_functions import dot, from_numbers, shape_of
+from rts.arrays.array_functions import from_numbers, shape_of
 from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.operations.unit import unit
@@ -9,7 +9,6 @@ __all__ = [
     "Array",
     "Tree",
     "constants",
-    "dot",
     "engine_of",
     "exemplar",
     "from_numbers",

@@ -202,7 +202,7 @@ def test_a_scene_of_numpy_with_a_torch_background_has_no_other_gradient(target):
 def test_where_only_the_pose_is_differentiable_the_mesh_is_evaluated_on_the_host(target):
     scene = {**SCENE, "transform": arrays(target, SCENE["transform"])}
     samples = rts.sample(part_of(scene), camera_at(SCENE["eye"]), SIZE, splatter=None).samples[0]
-    assert set(samples.gbuffer) == {"position", "normal", "color"}
+    assert set(samples.gbuffer) == {"position", "normal", "face_normal", "color"}
     assert type(samples.gbuffer["position"]) is type(scene["transform"])
     full = arrays(target, SCENE)
     assert rts.sample(part_of(full), camera_at(full["eye"]), SIZE, splatter=None).samples[0].gbuffer is None
