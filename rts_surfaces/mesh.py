@@ -195,9 +195,9 @@ class Mesh(TriangleSurface):
 
 def _face_normals(vertices: Array, samples: Samples, gbuffer: GBuffer) -> Array:
     """Normals (N, 3) of the triangles that samples are on, of any length, on the side of their "normal"."""
-    xp, normal = namespace(vertices, samples.ids), gbuffer["normal"]
-    a, b, c = (take(vertices, samples.ids[:, i]) for i in range(3))
-    face = xp.linalg.cross(b - a, c - a)
+    xp, ids, normal = namespace(vertices, samples.ids), samples.ids, gbuffer["normal"]
+    origin = take(vertices, ids[:, 0])
+    face = xp.linalg.cross(take(vertices, ids[:, 1]) - origin, take(vertices, ids[:, 2]) - origin)
     # NumPy takes ten times as long to sum along short axes.
     inward = sum(face[:, i : i + 1] * normal[:, i : i + 1] for i in range(3)) < 0
     return xp.where(inward, -face, face)
