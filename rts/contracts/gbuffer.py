@@ -17,7 +17,7 @@ class GBuffer(dict):
     attribute raises an `InputError`.
 
     Built-in surfaces use the names position, normal, uv and color. Meshes, whose normals are interpolated, also give
-    "face_normal" (N, 3), that of the triangle on the same side, of any length. If there is "uv",
+    "face_normal" (N, 3), that of the triangle on either side, of any length. If there is "uv",
     shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
     ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent" (N,
     4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal ×

@@ -240,12 +240,14 @@ def is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
     """(N, 1) bool, true where the viewer sees the side of a surface that normals point away from; without derivative.
 
     Near the outlines of a mesh, normals that are interpolated over a triangle turn away before the triangle does. So
-    "face_normal" tells which side is seen, if there is one.
+    "face_normal", on either side of the triangle, tells which side is seen, if there is one.
     """
-    arrays = gbuffer["position"], gbuffer["face_normal" if "face_normal" in gbuffer else "normal"], camera
+    face = gbuffer["face_normal"] if "face_normal" in gbuffer else None
+    arrays = gbuffer["position"], gbuffer["normal"], face, camera
     engine = engine_of(arrays)
-    position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)
-    return dot(normal, camera.toward(position)) < 0
+    position, normal, face, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)
+    toward = camera.toward(position)
+    return dot(normal, toward) < 0 if face is None else (dot(face, toward) < 0) != (dot(face, normal) < 0)
 
 
 def positive(x: Array) -> Array:
