@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -89,21 +90,54 @@ class Told(NamedTuple):
     Attributes:
         colors: False if each part has one colour, which any of its samples tells.
         motions: False if nothing moves (`is_still`) and colours are to be told.
+        centers: True if samples at centres tell the colours of surfaces that reach these: see `colored_at_centers`.
     """
 
     colors: bool = True
     motions: bool = True
+    centers: bool = False
 
     @classmethod
-    def of(cls, *scenes: Scene) -> Told:
+    def of(cls, scenes: Sequence[Scene], centers: bool) -> Told:
         """The tasks that the shaders of scenes, and derivatives in their values, set."""
         # Of one colour any two samples tell all, those of motions too.
         uniform = all(part.uniform for scene in scenes for part in scene.parts)
-        return cls(not uniform, uniform or not all(map(is_still, scenes)))
+        return cls(not uniform, uniform or not all(map(is_still, scenes)), centers and not uniform)
 
     def samples(self, layers: int) -> int:
         """The largest number of samples of a break, but for a pair."""
-        return (4 if self.colors and self.motions else 2) if layers == 1 else layers + 3
+        if layers > 1:
+            return layers + 3
+        return 4 if self.colors and self.motions and not self.centers else 2
+
+
+def colored_at_centers(outlines: Outlines, row: Array, told: Told) -> Outlines:
+    """Outlines whose colours are those of centres, on surfaces that reach these; of other pieces, one sample's.
+
+    Outlines where light passes through are returned as they are.
+
+    Args:
+        outlines: those of `Found`, without samples that centres stand for.
+        row: (K, H, W) int32, the samples at centres.
+        told: what samples tell; with `centers`, or outlines are returned as they are.
+    """
+    if not told.centers or outlines.stack is not None:
+        return outlines
+    xp, width, ends, rows = namespace(row), row.shape[-1], outlines.ends, outlines.rows
+    y, x, along = (outlines.gap[:, i] for i in range(3))
+    flat = xp.reshape(row[0, ...], (-1,))
+    first, last = (xp.take(flat, at) for at in (y * width + x, (y + 1 - along) * width + x + along))
+
+    def beside(of_breaks: Array, at_first: Array, at_last: Array) -> Array:
+        """What belongs to the surfaces (B, 2): at centres, or (B,) behind a break, which the next one has before it."""
+        before = xp.where(ends[:, 0], at_first, xp.roll(of_breaks, 1))
+        return xp.stack([before, xp.where(ends[:, 1], at_last, of_breaks)], axis=-1)
+
+    colors = beside(rows[:, 1], first, last)
+    if told.motions:
+        return replace(outlines, inner=colors)
+    behind = outlines.points[:, 1]
+    return replace(outlines, rows=colors, points=beside(behind, xp.zeros_like(behind), xp.ones_like(behind)))
 
 
 def columns(layers: int) -> tuple[int, int, int]:

@@ -16,7 +16,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Found, Told
+from rts.outlines.found import Found, Told, colored_at_centers
 from rts.outlines.gaps import Fronts
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
@@ -86,8 +86,8 @@ def with_outlines(
         behind = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
         behind = xp.reshape(behind, rows.shape)
     rows = xp.where(rows >= 0, rows + behind, rows)
-    outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
+    outlines = colored_at_centers(found.outlines(rows), cells.row, told)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
 
 

@@ -200,10 +200,13 @@ class Points:
         if count == 1 or stacks is None:
             # For each break the two last samples, which tell motions, and the two that tell colours.
             points, triangles = np.concatenate([breaks.points, breaks.inner], 1), breaks.triangles
-            if not self._told.motions:  # Those that tell colours come first, and are alone.
-                points, triangles = np.roll(points, 2, axis=1), np.roll(triangles, 2, axis=1)
-            one_kind = not (self._told.colors and self._told.motions)
-            parts = np.concatenate([breaks.parts, np.full_like(breaks.parts, -1) if one_kind else breaks.parts], 1)
+            told, first, none = self._told, breaks.parts, np.full_like(breaks.parts, -1)
+            if not told.motions:
+                if told.centers:  # What lies behind a break that is not the last.
+                    first = np.column_stack([none[:, 0], np.where(breaks.ends[:, 1], -1, first[:, 1])])
+                else:  # Those that tell colours come first, and are alone.
+                    points, triangles = np.roll(points, 2, axis=1), np.roll(triangles, 2, axis=1)
+            parts = np.concatenate([first, breaks.parts if told.samples(1) == 4 else none], 1)
             return breaks, parts, points, triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
         parts = np.concatenate([stacks.last, stacks.parts], 1)
         points = np.concatenate([breaks.points, stacks.points], 1)

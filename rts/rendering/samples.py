@@ -8,7 +8,6 @@ from dataclasses import replace
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
-from rts.outlines.found import Told
 from rts.outlines.of_scene import with_outlines
 from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
@@ -88,7 +87,7 @@ def sampled_scene(
     given, (scene, grid) = scene, on_the_host(scene, grid)
     if scene.cameras and joins and capacity is None and not settings.fronts:
         scene = with_joints(scene, grid)
-    told = Told.of(given) if one_shader else Told()
+    told = settings.told([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.
     same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
     request = Request(capacity, triangles=outlines or settings.fronts, uniform=same)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from rts.contracts.checks import check_size, check_splatter, is_auto
 from rts.contracts.splatter import Splatter
+from rts.outlines.found import Told
 from rts.plugin_base import promised
 from rts.sampling.layer_count import TRACED_LAYERS
 from rts.sampling.scene import Scene
@@ -73,6 +75,11 @@ class RenderSettings:
     def finds_outlines(self) -> bool:
         """True if the splatter reads the outlines between centres."""
         return self.splatter is not None and "outlines" in self.splatter.reads
+
+    def told(self, scenes: Sequence[Scene] | None) -> Told:
+        """What samples beside outlines have to tell of views of a scene; with None, of any shaders and derivatives."""
+        centers = self.splatter is not None and "colors at centers" in self.splatter.reads
+        return Told(centers=centers) if scenes is None else Told.of(scenes, centers)
 
     @property
     def most_layers(self) -> int:

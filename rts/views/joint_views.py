@@ -11,7 +11,6 @@ from rts.arrays.engines import Context, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Cells, Outlines, Sampled, Samples
-from rts.outlines.found import Told
 from rts.outlines.of_scene import with_outlines
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, real_of
@@ -26,7 +25,7 @@ def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: Rend
     scene, grid = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
-    outlines, layers, told = settings.finds_outlines, settings.most_layers, Told.of(*(view.scene for view in views))
+    outlines, layers, told = settings.finds_outlines, settings.most_layers, settings.told([x.scene for x in views])
     same = not told.colors and outlines and layers == 1 and not settings.fronts
     sampled = scene.joints[0].sampled(picture.size, layers, outlines, same)
     if outlines:

@@ -9,7 +9,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
-from rts.outlines.found import Found, Told
+from rts.outlines.found import Found, colored_at_centers
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_scene import real_of
 from rts.outlines.points import Points, at_centres, found_in_views
@@ -28,7 +28,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     sampled, picture, scenes = views.sampled, views.picture, sampling.scenes
     assert views.counts is not None
     grids = sampling.grids
-    told, none = Told.of(*scenes), [None] * len(scenes[0].parts)
+    told, none = sampling.settings.told(scenes), [None] * len(scenes[0].parts)
     first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]), told)
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
     points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, none, told), further)]
@@ -57,7 +57,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     nowhere = np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = outlines_side_by_side(outlines, picture, nowhere, nowhere)
+    joint = colored_at_centers(outlines_side_by_side(outlines, picture, nowhere, nowhere), cells.row, told)
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
     return with_counts(sampled, picture, tuple(counts))
 

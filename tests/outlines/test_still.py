@@ -117,8 +117,8 @@ BOUNDS = (-1.5,) * 3, (1.5,) * 3
 )
 def test_other_scenes_have_motions_told(surface, theta):
     still = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES, "color": torch.ones(3)}, "lambert")
-    assert Told.of(Scene.of([still], CAMERA, "auto", None)) == Told(motions=False)
-    assert Told.of(Scene.of([still, rts.Part(surface, theta, "lambert")], CAMERA, "auto", None)) == Told()
+    assert Told.of([Scene.of([still], CAMERA, "auto", None)], False) == Told(motions=False)
+    assert Told.of([Scene.of([still, rts.Part(surface, theta, "lambert")], CAMERA, "auto", None)], False) == Told()
 
 
 def test_a_program_whose_tint_is_traced_tells_colours_alone():

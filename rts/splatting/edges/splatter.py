@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
-from typing import Any
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, Literal
 
 import numpy as np
 
+from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, floating_bits
 from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
+from rts.errors import InputError
 from rts.operations.operation import Operation
 from rts.plugin_base import overrides
 from rts.splatting.cells import check_rows, nothing
@@ -27,17 +29,33 @@ def _fields_of(outlines: Outlines) -> list[Array]:
     return [getattr(outlines, name) for name in FIELDS]
 
 
+@dataclass(frozen=True)
 class Edges(SummingSplatter):
     """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
     Where light passes through, layers are composited, and each outline that is seen moves with its own layer; see
     `rts.splatting.edges.stacks`.
+
+    Attributes:
+        colors: "outlines" takes colours beside outlines from samples there. "centers" takes them from the centres of
+            pixels beside, on surfaces that reach these, so that an expensive shader is given fewer samples; where light
+            passes through it has no effect.
     """
 
+    colors: Literal["outlines", "centers"] = "outlines"
+
     layers = 1
-    reads = frozenset({"outlines"})
     translucent = True
     any_channels = True
+
+    def __post_init__(self):
+        if self.colors not in ("outlines", "centers"):
+            raise InputError(f"colors is {quoted(self.colors)}; expected 'outlines' or 'centers'")
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """See `rts.Splatter`."""
+        return frozenset({"outlines", "colors at centers"} if self.colors == "centers" else {"outlines"})
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
