@@ -101,9 +101,12 @@ def lego_on_page() -> dict[str, Any]:
     assert times is not None
     volume, ratio = float(times[1]), float(times[2])
     columns, lines = written("radiance-field", "lego at 100², 25 views")
-    used = lines["surface, fixed, by `edges`, K = 1"][columns.index("fine evaluations a covered pixel")]
+    used, spared = (
+        number(lines[f"surface, fixed, by `edges`{option}"][columns.index("fine evaluations a covered pixel")])
+        for option in (", K = 1", " with colours of centres")
+    )
     seconds = {"volume": volume, "surface": volume / ratio}
-    return {"sizes": [coarse, fine], "seconds": seconds, "edges": number(used)}
+    return {"sizes": [coarse, fine], "seconds": seconds, "edges": used, "centers": spared}
 
 
 def fern_on_page() -> dict[str, Any]:

@@ -50,8 +50,13 @@ TITLES = {
     "finetuned": "surface fixed, network finetuned",
     "joint": "surface and network, joint",
 }
-LAYERS = {"edges": 1, "multi": 2}
-"""Splatter → layers."""
+EDGES = rts.plugin("splatters", "edges")
+SPLATTERS = {
+    "edges": {"splatter": EDGES(), "layers": 1},
+    "centers": {"splatter": EDGES(colors="centers"), "layers": 1},
+    "multi": {"splatter": "multi", "layers": 2},
+}
+"""Name → options of a render."""
 FINE = 128
 """Evaluations of the fine network for a ray of volume rendering."""
 
@@ -85,7 +90,7 @@ def rendered(scene: Scene, values: Any, weights: Any, shot: Shot, shader: Any = 
 
 
 def _image(part: Any, scene: Scene, camera: rts.Camera, size: Any, engine: str = "torch", supersample: int = 1) -> Any:
-    options = {"splatter": scene.splatter, "layers": LAYERS[scene.splatter], "supersample": supersample}
+    options = SPLATTERS[scene.splatter] | {"supersample": supersample}
     return rts.render(part, camera, size, background=scene.behind(), engine=engine, **options)[..., :3]
 
 
@@ -331,7 +336,7 @@ def drawn(
         images.append(np.asarray(_image(part, scene, shot.camera, shot.size, supersample=supersample)))
         seconds.append(time.perf_counter() - begun)
         evaluations.append(sum(shaded))
-        options = {"splatter": scene.splatter, "layers": LAYERS[scene.splatter], "supersample": supersample}
+        options = SPLATTERS[scene.splatter] | {"supersample": supersample}
         found = rts.sample(part, shot.camera, shot.size, **options)
         apron, fine = found.apron, supersample
         row = found.row[0, apron:-apron, apron:-apron] >= 0
@@ -497,7 +502,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/snerf"))
     parser.add_argument("--scene", choices=("lego", "fern"), default="lego")
-    parser.add_argument("--splatter", choices=LAYERS, default="edges")
+    parser.add_argument("--splatter", choices=SPLATTERS, default="edges")
     parser.add_argument("--sides", nargs="+", type=int, choices=(100, 200, 400), default=[100, 400], help="of lego")
     parser.add_argument("--factor", type=int, default=3, help="of fern: 378 × 504 pixels over this")
     parser.add_argument("--fineness", type=float, default=1.0, help="of the lattice")

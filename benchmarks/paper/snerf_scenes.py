@@ -49,7 +49,7 @@ class Scene(NamedTuple):
         shape: of the lattice.
         ndc: the map from the world to the field's space, or None.
         background: what is behind.
-        splatter: the splatter of its images.
+        splatter: that of its images: "edges", "centers" (`edges` with colours of centres) or "multi".
     """
 
     field: Any

@@ -370,6 +370,12 @@ class TestEdges(SplatterConformance):
         return "edges"
 
 
+class TestEdgesAtCenters(TestEdges):
+    @pytest.fixture
+    def splatter(self):
+        return rts.plugin("splatters", "edges")(colors="centers")
+
+
 # ---------------------------------------------------------------------------------------------- broken plugins
 #
 # Each differs from a plugin that conforms in one respect.
