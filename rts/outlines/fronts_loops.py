@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.outlines.gaps import SEAM
 from rts.outlines.spans_loops import TINY
 
 LAST = 4e-5
@@ -31,6 +32,10 @@ ALIKE = 1e-5
 
 SHORT = 2e-5
 """Length of a piece of front that counts."""
+
+CREASE = np.tan(np.pi / 9)
+"""By how much a surface turns at a seam, along the gap; less if both triangles are large. Of many small triangles that
+hardly turn colours hardly change, and each is as expensive as an outline."""
 
 
 @compiled(inline="always")
@@ -178,7 +183,7 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
 
 @compiled(inline="always")
 def _kind(before, behind, nearer, stops, starts):
-    """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
+    """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; −1, not at all.
 
     Args:
         before: the part before the place, or −1.
@@ -187,7 +192,7 @@ def _kind(before, behind, nearer, stops, starts):
         stops: True if the surface before ends there, and goes on with no other span.
         starts: True if that behind starts there, and comes from no other.
     """
-    kind = 3
+    kind = -1
     if before < 0 or behind < 0:
         if before != behind:
             kind = 1 if before < 0 else 0
@@ -200,6 +205,24 @@ def _kind(before, behind, nearer, stops, starts):
     elif before != behind:
         kind = 0
     return kind
+
+
+@compiled(inline="always")
+def _is_seam(x, y, place, spans, names, width):
+    """True if the spans x and y meet at a place at edges that no triangles share, and are large, or turn there."""
+    if len(width) == 0 or x < 0 or y < 0 or names[x, 2] & 2 == 0 or names[y, 2] & 1 == 0:
+        return False
+    if names[x, 2] & names[y, 2] & 4 != 0:
+        return True
+    first, second, z = _rise(spans, x, place), _rise(spans, y, place), depth_at(spans, x, place)
+    step = width[0] + width[1] * z
+    return abs(first - second) * step > CREASE * (step * step + first * second)
+
+
+@compiled(inline="always")
+def _rise(spans, i, place):
+    """The slope of a span's depth along its gap at a place, a cell."""
+    return (spans[i, 3] - depth_at(spans, i, place) * spans[i, 5]) / (spans[i, 4] + spans[i, 5] * place)
 
 
 @loop
@@ -217,6 +240,7 @@ def breaks(
     ends,
     end_depth,
     inner,
+    width,
     rows,
     counts,
     whole,
@@ -241,9 +265,10 @@ def breaks(
         ends: (M, 2, 2) int32 to fill: part and triangle of the samples at both centres; −1 where nothing is seen.
         end_depth: (M, 2) to fill: their depths.
         inner: distance of the samples that tell colours.
+        width: the width of a cell at a depth, `width[0] + width[1] * depth`; none if seams do not count.
         rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
         counts: (M,) to fill: the number of breaks of each gap.
-        whole: (2 N + 4 M, 10) int32 to fill: gap, kind (0, 1 or 2), parts before and behind, then triangles of the last
+        whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles of the last
             samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for its last.
         numbers: (2 N + 4 M, 5) float64 to fill: place of the break, the last samples, and those that tell colours.
     """
@@ -272,14 +297,15 @@ def breaks(
             # What is seen at a centre goes on beyond it.
             stops, begun = x >= 0 and spans[x, 1] <= place + TOUCH, y >= 0 and spans[y, 0] >= place - TOUCH
             seamless = nearer < 0 and (x < 0 or stops) and (y < 0 or begun)
-            if before == behind and (t == s or seamless):
+            seam = seamless and before == behind and _is_seam(x, y, place, spans, names, width)
+            if before == behind and (t == s or seamless) and not seam:
                 continue
-            if nearer < 0:
+            if nearer < 0 and not seam:
                 begin = _rest(spans, begin, stop, place - 2 * TOUCH)
                 stops = stops and not _goes_on(spans, begin, stop, parts, x, place, 1)
                 begun = begun and not _goes_on(spans, begin, stop, parts, y, place, 0)
-            kind = _kind(before, behind, nearer, stops, begun)
-            if kind == 3:
+            kind = SEAM if seam else _kind(before, behind, nearer, stops, begun)
+            if kind < 0:
                 continue
             whole[row, 0], whole[row, 1], whole[row, 2], whole[row, 3] = g, kind, before, behind
             whole[row, 4], whole[row, 5], whole[row, 8], whole[row, 9] = t, s, count == 0, 0

@@ -97,13 +97,17 @@ class Gaps(NamedTuple):
         return cls(gap, rows, columns, cells)
 
 
+SEAM = 3
+"""`Breaks.near` where a surface goes on across edges that its triangles do not share, so that colours may change."""
+
+
 class Breaks(NamedTuple):
     """Breaks, those of a gap in order along it. Host arrays; see `rts.contracts.records.Outlines`.
 
     Attributes:
         gap: (B, 3) int32.
         place: (B, 2) float64.
-        near: (B,) int32.
+        near: (B,) int32; or SEAM.
         slope: (B, 2, 2) float64.
         ends: (B, 2) bool.
         points: (B, 2, 2) float64, x and y of the last samples before and behind each break.

@@ -17,7 +17,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Found, Told
-from rts.outlines.gaps import Breaks, Fronts, Oracle, find_breaks
+from rts.outlines.gaps import SEAM, Breaks, Fronts, Oracle, find_breaks
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import breaks_of_triangles
@@ -149,7 +149,8 @@ class Points:
         place = ((breaks.place - first) * along).sum(-1)
         places = ((points - first[:, None]) * along[:, None]).sum(-1)
         entries = places[:, 2:] if layered else places[:, :0]
-        of_breaks = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
+        near = np.where(breaks.near == SEAM, 0, breaks.near)  # There both surfaces move alike.
+        of_breaks = breaks.gap, places[:, :2], near, breaks.slope, breaks.ends
         segments = joined(breaks, layered)
         return Found(rows, parts, sides, entries, place, *of_breaks, *segments, breaks.joined, np.int32(left))
 
@@ -178,20 +179,25 @@ class Points:
 
     def broken(self, layers: Fronts, most: int | None) -> _Broken:
         """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
-        breaks, *others = self._breaks(layers)
+        breaks, *others = self._breaks(layers, self._told.colors)
+        if most is not None and len(breaks.gap) > most and (breaks.near == SEAM).any():
+            breaks, *others = self._breaks(layers, False)  # Outlines come first.
         left = 0 if most is None else max(0, len(breaks.gap) - most)
         if left:
             breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
             others = [x[:most] for x in others]
         return _Broken(breaks, *others, left)
 
-    def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """All breaks, and the other arrays of `_Broken`."""
+    def _breaks(
+        self, layers: Fronts, seams: bool
+    ) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """All breaks, and the other arrays of `_Broken`; of one layer with those at seams, if they are wanted."""
         every, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
         known, count = None not in every, len(layers.part)
         sheets = list({id(sheet): sheet for sheet in every}.values())
         if count == 1 and known:
-            breaks, stacks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width), None
+            breaks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width, seams)
+            stacks = None
         elif known:
             breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
         else:

@@ -52,7 +52,7 @@ def ends_of(gap, place, near, parts, height, width):
     Returns:
         Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
         corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
-        the sides leaves the front, −1 where it enters it, 0 where surfaces cross; the parts in front and behind.
+        the sides leaves the front, −1 where it enters it, 0 where surfaces cross, or at seams; the parts in front and behind.
     """
     square, along, ends = (
         np.empty(2 * len(gap), np.int64),
@@ -75,7 +75,7 @@ def ends_of(gap, place, near, parts, height, width):
             side = (2 if row == 1 else 1) if first == 0 else (0 if row == 1 else 3)
             square[count] = top * width + left
             along[count] = on_sides(at, at, side)
-            sign = 0 if near[b] == 2 else (1 if near[b] == 0 else -1)
+            sign = 0 if near[b] >= 2 else (1 if near[b] == 0 else -1)
             ends[count, 0], ends[count, 1], ends[count, 2] = b, side, sign if side < 2 else -sign
             ends[count, 3], ends[count, 4] = front, back
             count += 1

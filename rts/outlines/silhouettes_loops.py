@@ -240,7 +240,7 @@ def settle(width, depth, near, slope, tangent):
                 tangent[b, 0], tangent[b, 1] = y, -x
             else:
                 near[b] = 0
-        if near[b] < 2:
+        if near[b] != 2:
             slope[b] = 0.0
         length = np.hypot(tangent[b, 0], tangent[b, 1])
         if length > 0:

@@ -17,13 +17,15 @@ from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, cells_away
 from rts.outlines.sheets import Sheets
 
 
-def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndarray) -> Breaks:
+def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndarray, seams: bool) -> Breaks:
     """The breaks between the fronts (H, W) at the centres of all cells.
 
     Args:
         fronts: what is seen at centres.
         sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+        seams: whether there are breaks where a surface goes on across edges that its triangles do not share, and they
+            are large, or turn there: colours may change.
     """
     from rts.outlines import fronts_loops, spans_loops
 
@@ -41,7 +43,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
     seen = *map(read_only, fronts), np.empty((count, 2, 2), np.int32), np.empty((count, 2))
-    known = gaps.gap, begins, spans, names, parts, *seen, INNER, rows, counts, whole, numbers
+    known = gaps.gap, begins, spans, names, parts, *seen, INNER, width[: 2 * seams], rows, counts, whole, numbers
     parallel(fronts_loops.breaks, count, *known, work=600 * count)
     count = counts.sum()
     gap, points, near = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)

@@ -15,6 +15,9 @@ from rts.sampling.points_loops import corners_of, edge
 TINY = 1e-9
 """Shortest length of a span."""
 
+LARGE = 32.0
+"""Area in the image, in cells, from which on triangles are large."""
+
 SLACK = np.float32(0.01)
 """By how much boxes of triangles are larger than these, against rounding, in cells."""
 
@@ -157,7 +160,7 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
 
 @loop
 def spans_of(
-    first, last, triangles, begins, rows, vertices, faces, clip, keep, seen, gap, by_row, by_column, names, spans
+    first, last, triangles, begins, rows, vertices, faces, beyond, clip, keep, seen, gap, by_row, by_column, names, spans
 ):
     """Spans of triangles on gaps.
 
@@ -169,13 +172,15 @@ def spans_of(
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
+        beyond: (T, 3), see `sheets_loops.neighbours`.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         gap: see `Gaps`.
         by_row: see `Gaps`.
         by_column: see `Gaps`.
-        names: (N, 2) int32 to fill, gap and triangle of each span; filled with −1.
+        names: (N, 3) int32 to fill, of each span the gap, the triangle, and a sum: 1 if it starts at an edge that no
+            other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; filled with −1.
         spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d.
     """
     corners, box, line = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2))
@@ -184,7 +189,8 @@ def spans_of(
         sign = corners_of(t, rows, vertices, faces, corners)
         if not abs(sign) > 0 or sign * keep < 0:  # NaN, too.
             continue
-        _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
+        size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
+        large = 0 if abs(size) < 2 * LARGE else 4  # Those that are seen in part, too.
         cut = _cut(t, clip, vertices, faces)
         for axis in range(2):
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
@@ -193,23 +199,31 @@ def spans_of(
                 if table[n, low] == table[n, high]:
                     continue
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
-                least, most = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
+                least, most, start, end = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
                 on_line = table[n, low], table[n, high], 1 - axis
-                count = _add(t, on_line, least, most, gap, line, corners, names, spans, count)
+                bounds = least, most, _is_open(beyond, t, start) + 2 * _is_open(beyond, t, end) + large
+                count = _add(t, on_line, bounds, gap, line, corners, names, spans, count)
 
 
 @compiled(inline="always")
-def _add(t, on_line, least, most, gap, line, corners, names, spans, count):
-    """Add the spans of a triangle on gaps of a line, where it is seen from `least` to `most`; returns `count`.
+def _is_open(beyond, t, edge):
+    """1 if an edge of a triangle has no other triangle beyond it; 0 for what is no edge, but a plane."""
+    return 1 if 0 <= edge < 3 and beyond[t, edge] < 0 else 0
 
-    `on_line` are the first gap, the one after the last, and the column of `gap` that tells where they begin.
+
+@compiled(inline="always")
+def _add(t, on_line, bounds, gap, line, corners, names, spans, count):
+    """Add the spans of a triangle on gaps of a line; returns `count`.
+
+    `on_line` are the first gap, the one after the last, and the column of `gap` that tells where they begin; `bounds`
+    are where on the line the triangle is seen, from and to, and the last number of its `names`.
     """
-    first, last, column = on_line
+    (first, last, column), (least, most, kind) = on_line, bounds
     for g in range(first, last if most - least > TINY else first):
         start, end = least - 0.5 - gap[g, column], most - 0.5 - gap[g, column]
         # Those that touch it count, since a layer may end at a centre.
         if min(end, 1.0) - max(start, 0.0) >= -TINY:
-            names[count, 0], names[count, 1] = g, t
+            names[count, 0], names[count, 1], names[count, 2] = g, t, kind
             _fill(spans, count, start, end, line, corners, gap[g, column] + 0.5)
             count += 1
     return count
@@ -252,17 +266,20 @@ def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
 
 @compiled(inline="always")
 def _inside(line, low, high):
-    """The interval, within one that is given, where all functions of a line are positive."""
+    """The interval, within one that is given, where all functions of a line are positive; and those that bound it."""
+    start, end = -1, -1
     for k in range(5):
         c, d = line[k, 0], line[k, 1]
         if d > 0:
-            low = max(low, -c / d)
+            at = -c / d
+            low, start = (at, k) if at > low else (low, start)
         elif d < 0:
-            high = min(high, -c / d)
+            at = -c / d
+            high, end = (at, k) if at < high else (high, end)
         elif c < 0:
             high = -np.inf
     # An edge along the line, but for rounding, meets it farther away than integers reach.
-    return (low, high) if low < high else (0.0, -1.0)
+    return (low, high, start, end) if low < high else (0.0, -1.0, -1, -1)
 
 
 @compiled(inline="always")

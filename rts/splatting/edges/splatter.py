@@ -29,7 +29,7 @@ def _fields_of(outlines: Outlines) -> list[Array]:
     return [getattr(outlines, name) for name in FIELDS]
 
 
-@dataclass(frozen=True)
+@dataclass(unsafe_hash=True)
 class Edges(SummingSplatter):
     """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
