@@ -62,6 +62,7 @@ class Mesh(TriangleSurface):
                     self._columns[name] = 3 * len(self._tables)
                     self._tables.append(table)
         self._ids = self.faces if len(self._tables) == 1 else read_only(np.concatenate(self._tables, axis=1))
+        self._corners = None if len(self._tables) == 1 else _corners(self._tables)
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
@@ -70,7 +71,7 @@ class Mesh(TriangleSurface):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make a copy's tables read-only, too."""
         vars(self).update(state)
-        for table in (*self._tables, self._ids):
+        for table in (*self._tables, self._ids, *([] if self._corners is None else [self._corners])):
             table.flags.writeable = False
 
     def __repr__(self) -> str:
@@ -154,7 +155,7 @@ class Mesh(TriangleSurface):
 
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
         """The mesh itself, its vertices in float32."""
-        return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
+        return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids, corners=self._corners)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated positions and attributes; see the class for their names."""
@@ -191,6 +192,16 @@ class Mesh(TriangleSurface):
         if kept is None or kept[0] != key:
             kept = self._normals = (key, vertex_normals(vertices, self.faces))
         return kept[1]
+
+
+def _corners(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """`Proxy.corners` (T, 3) of tables (T, 3): corners are alike which are so in all tables."""
+    numbers = tables[0].astype(np.int64)
+    for table in tables[1:]:
+        numbers = np.unique(numbers * (int(table.max()) + 1) + table, return_inverse=True)[1].reshape(numbers.shape)
+    found = numbers.astype(np.int32)
+    found.flags.writeable = False  # It owns its memory, so that what is known of it is kept.
+    return found
 
 
 def _face_normals(vertices: Array, samples: Samples) -> Array:

@@ -42,12 +42,15 @@ class Proxy(NamedTuple):
         ids: (T, I) int32, handed on to the samples of the triangle. None means `faces`; or no ids, if I = 0 and the
             surface has no `refine`.
         corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
+        corners: (T, 3) int32, alike for two triangles at a vertex where these have the same attributes; None means
+            `faces`. Where they differ at an edge there is a seam, across which colours may change.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     ids: np.ndarray | None = None
     corner_params: np.ndarray | None = None
+    corners: np.ndarray | None = None
 
 
 class Fragments(NamedTuple):

@@ -112,19 +112,20 @@ class Points:
             told: what samples have to tell.
         """
         parts, joints = [], {joint.first: joint for joint in scene.joints}
+        seams = told.colors and all(scene.opaque)
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
             camera, sheets, joint = scene.local_camera(index, grid), None, joints.get(index)
             if joint is not None:
-                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies)
+                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies, seams)
             elif parts and parts[-1][3] is not None and index in parts[-1][3].parts:
                 sheets = parts[-1][3]
             elif isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if has_sheets(part, sampler):
-                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index)
+                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index, seams=seams)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts, told)
 

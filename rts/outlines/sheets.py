@@ -23,7 +23,8 @@ class Sheets(NamedTuple):
         starts: (P + 1,) int32, where the triangles of each part begin.
         vertices: (V, 3) float32.
         faces: (T, 3) int32.
-        beyond: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it.
+        beyond: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it, and
+            at seams, if they are wanted.
         rows: (4, 4), see `Camera.pixel_rows`.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants on screen of triangles to keep; 0 for both.
@@ -56,6 +57,7 @@ class Sheets(NamedTuple):
         cull: str,
         first: int = 0,
         proxies: Sequence[Proxy] | None = None,
+        seams: bool = False,
     ) -> Sheets:
         """The sheets of a proxy.
 
@@ -66,6 +68,7 @@ class Sheets(NamedTuple):
             cull: as in `TriangleSampler.rasterize`.
             first: the index of the first part.
             proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; None for one.
+            seams: whether sheets end at seams (`Proxy.corners`), too.
         """
         from rts.outlines import sheets_loops, silhouettes_loops
 
@@ -73,7 +76,8 @@ class Sheets(NamedTuple):
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=4 * len(seen))
-        tables, sides = [x.faces for x in proxies or [proxy]], np.zeros(len(faces) + 1, np.int8)
+        every, sides = proxies or [proxy], np.zeros(len(faces) + 1, np.int8)
+        tables = [x.faces if x.corners is None or not seams else x.corners for x in every]
         starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
         beyond = [_beyond(table) for table in tables]
         if proxies is not None:

@@ -52,13 +52,14 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
             f"the proxy of {surface!r} has {corner_text} a corner, but sample_widths says "
             f"{surface.sample_widths[1]}; make them agree"
         )
-    for name, array in (("ids", ids), ("corner_params", corners)):
+    numbers = None if proxy.corners is None else _table(surface, "corners", proxy.corners, (3,), np.int32)
+    for name, array in (("ids", ids), ("corner_params", corners), ("corners", numbers)):
         if array is not None and len(array) < len(faces):
             raise InputError(
                 f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {array.shape}; "
                 f"expected a row a face"
             )
-    return Proxy(vertices, faces, ids, corners)
+    return Proxy(vertices, faces, ids, corners, numbers)
 
 
 def check_faces(proxy: Proxy, surface: Any = None) -> None:
