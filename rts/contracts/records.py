@@ -212,7 +212,7 @@ class Outlines:
     """Outlines between the centres of cells: places where a front ends, joined into segments. They have no derivative.
 
     A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
-    another surface is a break. Four neighbouring centres are the corners of a square; breaks on its
+    another surface, or across a seam, is a break. Four neighbouring centres are the corners of a square; breaks on its
     sides are joined into segments.
 
     Attributes:
@@ -228,7 +228,7 @@ class Outlines:
             deepest point, or −1: the break moves as their mean (`RaySurface.deepest`). A single sample does not tell
             how a kink of a field moves.
         near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
-            surfaces pass through one another.
+            surfaces pass through one another; at seams 0, where a surface goes on and its colours may change.
         slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
         ends: (B, 2) bool: is this the gap's first break, and its last?
         square: (S, 2) int32, the first corner (y, x) of each segment's square.

@@ -268,8 +268,9 @@ def breaks(
         width: the width of a cell at a depth, `width[0] + width[1] * depth`; none if seams do not count.
         rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
         counts: (M,) to fill: the number of breaks of each gap.
-        whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles of the last
-            samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for its last.
+        whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles
+            of the last samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for
+            its last.
         numbers: (2 N + 4 M, 5) float64 to fill: place of the break, the last samples, and those that tell colours.
     """
     most = 4

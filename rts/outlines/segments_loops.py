@@ -52,7 +52,8 @@ def ends_of(gap, place, near, parts, height, width):
     Returns:
         Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
         corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
-        the sides leaves the front, −1 where it enters it, 0 where surfaces cross, or at seams; the parts in front and behind.
+        the sides leaves the front, −1 where it enters it, 0 where surfaces cross and at seams; the parts in front and
+        behind.
     """
     square, along, ends = (
         np.empty(2 * len(gap), np.int64),

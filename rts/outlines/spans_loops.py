@@ -160,7 +160,22 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
 
 @loop
 def spans_of(
-    first, last, triangles, begins, rows, vertices, faces, beyond, clip, keep, seen, gap, by_row, by_column, names, spans
+    first,
+    last,
+    triangles,
+    begins,
+    rows,
+    vertices,
+    faces,
+    beyond,
+    clip,
+    keep,
+    seen,
+    gap,
+    by_row,
+    by_column,
+    names,
+    spans,
 ):
     """Spans of triangles on gaps.
 

@@ -130,7 +130,7 @@ def test_engines_agree(scene, grid):
     for target in ("torch-cpu", "jax"):
         theta = arrays(target, {"values": grid, "weights": scene.field.weights["fine"]})
         part = scene.part(theta["values"], theta["weights"])
-        sampled = rts.sample(part, camera, WINDOW, splatter="multi", layers=snerf.LAYERS["multi"])
+        sampled = rts.sample(part, camera, WINDOW, splatter="multi", layers=snerf.SPLATTERS["multi"]["layers"])
 
         def product(theta, part=part, sampled=sampled, target=target):
             image = rts.render_samples(sampled, part.replace(theta=theta), camera, **options)[..., :3]
