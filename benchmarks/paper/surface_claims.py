@@ -171,8 +171,8 @@ def lego(numbers: dict[str, Any]) -> list[Row]:
         ratio = numbers["seconds"]["volume"] / numbers["seconds"]["surface"]
         told += f"; a frame takes {ratio:.0f} times less"
     if "edges" in numbers:
-        told += f"; `edges`: {numbers['edges']:.2f} of one layer, on the surface as it is found, or {numbers['centers']:.2f}"
-        told += " with colours of centres"
+        told += f"; `edges`: {numbers['edges']:.2f} of one layer, on the surface as it is found"
+        told += f", or {numbers['centers']:.2f} with colours of centres"
     rows.append(
         Row(
             "One evaluation a pixel instead of 128",
