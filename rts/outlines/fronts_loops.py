@@ -208,11 +208,14 @@ def _kind(before, behind, nearer, stops, starts):
 
 
 @compiled(inline="always")
-def _is_seam(x, y, place, spans, names, width):
-    """True if the spans x and y meet at a place at edges that no triangles share, and are large, or turn there."""
-    if len(width) == 0 or x < 0 or y < 0 or names[x, 2] & 2 == 0 or names[y, 2] & 1 == 0:
+def is_seam(x, y, first_kind, second_kind, place, spans, width):
+    """True if a surface goes on from the span x to y at a place across a seam, and they are large, or turn there.
+
+    The kinds are the last numbers of their `names`, see `spans_loops.spans_of`; for `width` see `breaks`.
+    """
+    if len(width) == 0 or first_kind & 2 == 0 or second_kind & 1 == 0:
         return False
-    if names[x, 2] & names[y, 2] & 4 != 0:
+    if first_kind & second_kind & 4 != 0:
         return True
     first, second, z = _rise(spans, x, place), _rise(spans, y, place), depth_at(spans, x, place)
     step = width[0] + width[1] * z
@@ -298,7 +301,8 @@ def breaks(
             # What is seen at a centre goes on beyond it.
             stops, begun = x >= 0 and spans[x, 1] <= place + TOUCH, y >= 0 and spans[y, 0] >= place - TOUCH
             seamless = nearer < 0 and (x < 0 or stops) and (y < 0 or begun)
-            seam = seamless and before == behind and _is_seam(x, y, place, spans, names, width)
+            seam = seamless and before == behind and x >= 0 and y >= 0
+            seam = seam and is_seam(x, y, names[x, 2], names[y, 2], place, spans, width)
             if before == behind and (t == s or seamless) and not seam:
                 continue
             if nearer < 0 and not seam:

@@ -112,20 +112,19 @@ class Points:
             told: what samples have to tell.
         """
         parts, joints = [], {joint.first: joint for joint in scene.joints}
-        seams = told.colors and all(scene.opaque)
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
             camera, sheets, joint = scene.local_camera(index, grid), None, joints.get(index)
             if joint is not None:
-                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies, seams)
+                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies, told.colors)
             elif parts and parts[-1][3] is not None and index in parts[-1][3].parts:
                 sheets = parts[-1][3]
             elif isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if has_sheets(part, sampler):
-                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index, seams=seams)
+                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index, seams=told.colors)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts, told)
 
@@ -181,7 +180,7 @@ class Points:
     def broken(self, layers: Fronts, most: int | None) -> _Broken:
         """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
         breaks, *others = self._breaks(layers, self._told.colors)
-        if most is not None and len(breaks.gap) > most and (breaks.near == SEAM).any():
+        if most is not None and len(breaks.gap) > most and self._told.colors:
             breaks, *others = self._breaks(layers, False)  # Outlines come first.
         left = 0 if most is None else max(0, len(breaks.gap) - most)
         if left:
@@ -200,7 +199,7 @@ class Points:
             breaks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width, seams)
             stacks = None
         elif known:
-            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
+            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width, seams)
         else:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle)

@@ -61,7 +61,11 @@ def ends_of(gap, place, near, parts, height, width):
         np.empty((2 * len(gap), 5), np.int32),
     )
     count = 0
-    for b in range(len(gap)):
+    # Those on the sides 2 and 3, against the way of their gaps, come last and backwards: so that breaks in one place
+    # are in order clockwise.
+    for n in range(2 * len(gap)):
+        backwards = n >= len(gap)
+        b = 2 * len(gap) - 1 - n if backwards else n
         y, x, row = gap[b, 0], gap[b, 1], gap[b, 2]
         at = place[b, 0] - x - 0.5 if row == 1 else place[b, 1] - y - 0.5
         at = min(max(at, 0.0), 1 - 1e-9)
@@ -74,6 +78,8 @@ def ends_of(gap, place, near, parts, height, width):
             if top < 0 or left < 0 or top >= height - 1 or left >= width - 1:
                 continue
             side = (2 if row == 1 else 1) if first == 0 else (0 if row == 1 else 3)
+            if (side >= 2) != backwards:
+                continue
             square[count] = top * width + left
             along[count] = on_sides(at, at, side)
             sign = 0 if near[b] >= 2 else (1 if near[b] == 0 else -1)

@@ -17,7 +17,7 @@ from rts.outlines.spans import moving_edges, spans_on
 
 
 def breaks_of_stacks(
-    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
+    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray, seams: bool
 ) -> tuple[Breaks, Stacks]:
     """The breaks between the stacks at the centres of all cells, and the layers there.
 
@@ -26,9 +26,10 @@ def breaks_of_stacks(
         opaque: (P,) bool, the parts that let no light through.
         sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+        seams: as of `breaks_of_triangles`; at each there are two breaks in one place.
     """
     gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
-    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets)
+    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets, width[: 2 * seams])
     gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
     joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
     inside, part = layers.part[0] >= 0, layers.part
@@ -72,7 +73,7 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 
 
 def _changes(
-    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
+    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The changes of stacks along gaps; see `stacks_loops.changes`."""
     from rts.outlines import stacks_loops as loops
@@ -91,9 +92,9 @@ def _changes(
         return np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
 
     known = begins, spans, names, parts, opaque, seen, depth, counts
-    parallel(loops.changes, count, *known, at, False, INNER, *filled(0), work=300 * count)
+    parallel(loops.changes, count, *known, at, False, INNER, width, *filled(0), work=300 * count)
     at = np.cumsum(counts) - counts
     result = filled(int(counts.sum()))
-    parallel(loops.changes, count, *known, at, True, INNER, *result, work=300 * count)
+    parallel(loops.changes, count, *known, at, True, INNER, width, *result, work=300 * count)
     whole, place, samples, places, sides = result
     return whole, place, samples, places, sides

@@ -5,7 +5,7 @@ the back does that it turns into. The stack at a place is the runs there, front 
 or ends, and where two runs pass through one another.
 
 Each gap works on tables of its own, copied from those of all spans: `own` (n, 8), the six columns of
-`spans_loops.spans_of`, then where a run starts and ends; and `of` (n, 7), integers. To pass an array on, threads count
+`spans_loops.spans_of`, then where a run starts and ends; and `of` (n, 8), integers. To pass an array on, threads count
 its references in turns, so that helpers take few, and none that is shared in their inmost loops.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.fronts_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at
+from rts.outlines.fronts_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at, is_seam
 from rts.outlines.spans_loops import TINY
 
 CLOSE = 1e-5
@@ -26,9 +26,9 @@ SAME = 1e-4
 LOW, HIGH = 6, 7
 """Columns of `own`: where a run starts, in the row of its first span, and where it ends, in that of its last."""
 
-PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE = range(7)
+PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE, EDGES = range(8)
 """Columns of `of`: part and triangle of a span; 1 if the part lets no light through; the spans that it goes on with, or
-−1; 1 if its run is real; 1 if the run is, or has been, in the stack."""
+−1; 1 if its run is real; 1 if the run is, or has been, in the stack; the last of the span's `names`."""
 
 
 @compiled(inline="always")
@@ -39,14 +39,15 @@ def _alike(own, i, j, place):
 
 
 @compiled(inline="always")
-def _link(own, of, n):
-    """Fill in the columns AFTER and BEFORE of n spans."""
+def _link(own, of, n, width):
+    """Fill in the columns AFTER and BEFORE of n spans. At seams a run ends, and the next one starts."""
     for i in range(n):
         for j in range(n):
             if i == j or of[j, BEFORE] >= 0 or of[i, PART] != of[j, PART] or not own[j, HIGH] > own[i, HIGH]:
                 continue
             if abs(own[j, LOW] - own[i, HIGH]) <= TOUCH and _alike(own, i, j, own[i, HIGH]):
-                of[i, AFTER], of[j, BEFORE] = j, i
+                if not is_seam(i, j, of[i, EDGES], of[j, EDGES], own[i, HIGH], own, width):
+                    of[i, AFTER], of[j, BEFORE] = j, i
                 break
 
 
@@ -302,9 +303,9 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
 
 
 @compiled(inline="always")
-def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
+def _fill_runs(g, n, own, of, opaque, seen, depth, knots, width):
     """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
-    _link(own, of, n)
+    _link(own, of, n, width)
     for i in range(n):
         if of[i, BEFORE] >= 0:
             continue
@@ -398,8 +399,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
 
 @loop
 def changes(
-    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
-    samples, places, sides,
+    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, width, whole,
+    place_of, samples, places, sides,
 ):  # fmt: skip
     """Count the changes of stacks along gaps, or fill them in, in order.
 
@@ -410,7 +411,7 @@ def changes(
         last: the gap after the last.
         begins: (M + 1,) where the spans of each gap begin.
         spans: (N, 6), see `spans_loops.spans_of`.
-        names: (N, 2) gap and triangle.
+        names: (N, 3), see `spans_loops.spans_of`.
         parts: (N,) int32.
         opaque: bool, for each part.
         seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
@@ -419,6 +420,7 @@ def changes(
         at: (M,) where the changes of each gap begin; used if
         fill: True to fill in what follows, False to count.
         inner: distance of the samples that tell colours of what ends.
+        width: the width of a cell at a depth, `width[0] + width[1] * depth`; none if seams do not count.
         whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
             and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
@@ -430,7 +432,7 @@ def changes(
     longest, most_changes = 0, 0
     for g in range(first, last):
         longest, most_changes = max(longest, begins[g + 1] - begins[g]), max(most_changes, counts[g])
-    own, of = np.empty((longest, 8)), np.empty((longest, 7), np.int64)
+    own, of = np.empty((longest, 8)), np.empty((longest, 8), np.int64)
     stack, knots = np.empty(longest + 1, np.int64), np.empty(2 * longest + 1)
     enders = np.empty((most_changes, 2), np.int64)
     for g in range(first, last):
@@ -441,8 +443,8 @@ def changes(
                 own[i, c] = spans[x, c]
             own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
             of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
-            of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE] = -1, -1, 0, 0
-        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0
+            of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE], of[i, EDGES] = -1, -1, 0, 0, names[x, 2]
+        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots, width), 0
         for i in range(n):
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))
