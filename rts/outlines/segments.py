@@ -52,5 +52,5 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     filled = origin, ties, square_sides, neighbours, *known, triangle, corner, pull
     parallel(loops.corners, len(ties), *filled, work=150 * len(ties))
     hub = np.zeros(len(ties), np.int32)
-    loops.meet(origin, ties, square_sides, *known, hub, corner, pull, neighbours)
+    loops.meet(origin, ties, square_sides, *known, breaks.near, hub, corner, pull, neighbours)
     return Segments(origin, ties, square_sides, hub, np.ascontiguousarray(neighbours[:, 1:3]), corner, pull)

@@ -6,6 +6,7 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.contracts.records import REACH
+from rts.outlines.gaps import SEAM
 
 LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
 """Costs, in cells, beside the length of segments: a break that stays alone; a segment between two breaks on one side,
@@ -32,6 +33,9 @@ CLOSE = 1e-4
 ALIKE = 1e-6
 """Distance, in cells, of two breaks that are in one place."""
 
+TIE = 1e-4
+"""Difference of distances, in cells, that does not tell which of two outlines another one ends at: it is rounding."""
+
 MOST_ALIKE = 4
 """The most breaks in one place: a centre is the end of so many gaps."""
 
@@ -53,7 +57,7 @@ def ends_of(gap, place, near, parts, height, width):
         Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
         corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
         the sides leaves the front, −1 where it enters it, 0 where surfaces cross and at seams; the parts in front and
-        behind.
+        behind. Seams have a negative number for both, so that they are joined among themselves.
     """
     square, along, ends = (
         np.empty(2 * len(gap), np.int64),
@@ -72,6 +76,8 @@ def ends_of(gap, place, near, parts, height, width):
         front, back = parts[b, 0], parts[b, 1]
         if near[b] == 1 or (near[b] == 2 and front > back):
             front, back = back, front
+        if near[b] == SEAM:
+            front, back = -2 - front, -2 - front
         for first in range(2):
             # Above and below a row's gap, left and right of a column's.
             top, left = y - (row if first == 0 else 0), x - (1 - row if first == 0 else 0)
@@ -410,7 +416,7 @@ def _on_segment(origin, s, e, ties, place, corner):
 
 
 @compiled(inline="always")
-def _end_at(s, other, way, origin, ties, place, clock, corner):
+def _end_at(s, other, way, origin, ties, place, clock, corner, near):
     """Where the outline of the lone break of a segment would end at another one; see `meet`.
 
     Returns:
@@ -421,10 +427,10 @@ def _end_at(s, other, way, origin, ties, place, clock, corner):
     for e in range(2):
         end, middle = _on_segment(origin, other, e, ties, place, corner)
         t, off, ahead = _towards(start, way, end, middle)
-        if off < least - ALIKE or (off < least + ALIKE and ahead < nearest):
+        if off < least - TIE or (off < least + TIE and ahead < nearest - TIE):
             best, least, nearest = t if e == 0 else 2 - t, off, ahead
-    # What the other segment bounds lies on the right of its way, and hides what is behind on its left.
-    hidden = _between(clock[s, 0], clock[other, 0], clock[other, 1])
+    # What the other segment bounds lies on the right of its way, and hides what is behind on its left. Seams hide none.
+    hidden = near[ties[other, 0]] == SEAM or _between(clock[s, 0], clock[other, 0], clock[other, 1])
     return best, least + (0.0 if hidden else ON_FRONT), nearest
 
 
@@ -459,15 +465,15 @@ def _crossing(s, other, origin, ties, place, corner):
 
 
 @compiled(inline="always")
-def _hub(first, stop, s, way, origin, ties, place, clock, hub, corner):
+def _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near):
     """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
     step, on, least, nearest = 0, 0.0, np.inf, np.inf
     for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
         if ties[other, 1] < 0 or other == s:
             continue
         if ties[s, 1] < 0:
-            t, off, ahead = _end_at(s, other, way, origin, ties, place, clock, corner)
-            nearer = off < least - ALIKE or (off < least + ALIKE and ahead < nearest)
+            t, off, ahead = _end_at(s, other, way, origin, ties, place, clock, corner, near)
+            nearer = off < least - TIE or (off < least + TIE and ahead < nearest - TIE)
             if nearer and not _apart(first, stop, s, other, ties, clock):
                 step, on, least, nearest = other - s, t, off, ahead
             continue
@@ -492,8 +498,10 @@ def _where_both_end(s, other, origin, ties, square_sides, place, tangent):
 
 
 @loop
-def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, neighbours):
-    """Fill in `hub` (S,), and what else `Outlines` has of the segments with one; other arguments are as of `corners`.
+def meet(origin, ties, square_sides, place, tangent, near, hub, corner, pull, neighbours):
+    """Fill in `hub` (S,), and what else `Outlines` has of the segments with one.
+
+    `near` (B,) is that of `Breaks`; other arguments are as of `corners`.
 
     A lone break ends at a segment of its square, since what this bounds hides the rest. The outline goes on along its
     tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone breaks
@@ -513,7 +521,7 @@ def meet(origin, ties, square_sides, place, tangent, hub, corner, pull, neighbou
             stop += 1
         for s in range(first, stop):
             way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
-            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, clock, hub, corner)
+            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near)
         lead, alone = -1, True
         for s in range(first, stop):
             if ties[s, 1] >= 0 or hub[s] != 0:

@@ -31,7 +31,8 @@ def plane_at(corners, sign, x, y):
 def neighbours(faces, order):
     """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 where none or several share it.
 
-    `order` (3 T,) sorts the edges (3 t + corner) by their ends.
+    The other side of a triangle, with the same corners, does not count. `order` (3 T,) sorts the edges (3 t + corner)
+    by their ends.
     """
     found = np.full((len(faces), 3), -1, np.int32)
     n = 0
@@ -47,7 +48,8 @@ def neighbours(faces, order):
             m += 1
         if m == n + 2:
             s, d = order[n + 1] // 3, order[n + 1] % 3
-            found[t, c], found[s, d] = s, t
+            if faces[s, d] != faces[t, c]:
+                found[t, c], found[s, d] = s, t
         n = m
     return found
 

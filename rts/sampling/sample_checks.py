@@ -54,7 +54,7 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
         )
     numbers = None if proxy.corners is None else _table(surface, "corners", proxy.corners, (3,), np.int32)
     for name, array in (("ids", ids), ("corner_params", corners), ("corners", numbers)):
-        if array is not None and len(array) < len(faces):
+        if array is not None and (len(array) < len(faces) or (name == "corners" and len(array) > len(faces))):
             raise InputError(
                 f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {array.shape}; "
                 f"expected a row a face"

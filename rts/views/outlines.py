@@ -57,7 +57,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     nowhere = np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = colored_at_centers(outlines_side_by_side(outlines, picture, nowhere, nowhere), cells.row, told)
+    joint = colored_at_centers(outlines_side_by_side(outlines, picture, nowhere, nowhere), host_value(cells.row), told)
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
     return with_counts(sampled, picture, tuple(counts))
 

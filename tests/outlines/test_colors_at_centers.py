@@ -112,6 +112,9 @@ def test_every_way_draws_the_same():
         "moving": rts.render(moving, CAMERA, SIZE, splatter=CENTERS),
         "views": rts.render_views(scene(False), CAMERAS, SIZE, splatter=CENTERS)[0],
         "views that move": rts.render_views(moving, CAMERAS, SIZE, splatter=CENTERS)[0],
+        "views of several kinds": rts.render_views(
+            [scene(False)[0].replace(cull="back"), *scene(False)[1:]], CAMERAS, SIZE, splatter=CENTERS
+        )[0],
         "samples": rts.render_samples(
             rts.sample(scene(False), CAMERA, SIZE, splatter=CENTERS), scene(False), CAMERA, splatter=CENTERS
         ),

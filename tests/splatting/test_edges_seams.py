@@ -131,6 +131,33 @@ def test_every_way_draws_the_same():
         np.testing.assert_allclose(np.asarray(image), expected, atol=3e-5, err_msg=name)
 
 
+@pytest.mark.parametrize("cull", ["none", "back"])
+def test_sides_that_are_there_with_both_windings_have_seams(cull):
+    part = box(False)
+    faces = part.surface.faces
+    both = rts.Part(rts.Mesh(np.concatenate([faces, faces[:, ::-1]])), part.theta, "unlit", cull=cull)
+    image, truth = (np.asarray(rts.render(both, CAMERA, (48, 48), supersample=s)) for s in (1, 16))
+    assert (np.abs(image - truth).max(axis=-1) > 1e-3).sum() <= 8  # Beside corners: diagonals are seams, too.
+
+
+def test_outlines_are_joined_to_no_seams():
+    """Alpha, and how it changes, are those of one colour, but where a seam ends at the outline."""
+    table = np.array([[0, 0, 0], [0, 0, 0], [1, 1, 1], [1, 1, 1]])
+    corners, colors = torch.as_tensor(flat(turned(ROOM, 0.3, (12.2, 11.7)))), np.array([RED, GREEN], np.float32)
+    back = box().replace(transform=np.diag([6.0, 6, 6, 1]) + np.eye(4, k=3) * [[14], [0], [0], [0]])
+
+    def drawn(shader):
+        def of(t):
+            moved = corners + t * torch.tensor([1.0, 0.3, 0.0])
+            front = rts.Part(rts.Mesh(HALVES, {"colors": table}), {"vertices": moved, "colors": colors}, shader)
+            return rts.render([front, back.replace(shader=shader)], in_pixels(), SIZE)[..., 3]
+
+        return pushed(of)
+
+    for colored, plain in zip(drawn("unlit"), drawn("silhouette"), strict=True):
+        assert (np.abs(colored - plain) > 1e-4).sum() <= 2
+
+
 def test_where_breaks_have_no_room_outlines_come_first():
     """A rough ball whose triangles share no vertices, seen by a program, has more seams than that has room for."""
     jax = pytest.importorskip("jax")
