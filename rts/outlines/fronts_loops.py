@@ -33,9 +33,9 @@ ALIKE = 1e-5
 SHORT = 2e-5
 """Length of a piece of front that counts."""
 
-CREASE = np.tan(np.pi / 9)
-"""By how much a surface turns at a seam, along the gap; less if both triangles are large. Of many small triangles that
-hardly turn colours hardly change, and each is as expensive as an outline."""
+CREASE = np.cos(np.pi / 9)
+"""Cosine of the angle by which a surface turns at a seam; less if both triangles are large. Of many small triangles
+that hardly turn colours hardly change, and each is as expensive as an outline."""
 
 
 @compiled(inline="always")
@@ -208,24 +208,16 @@ def _kind(before, behind, nearer, stops, starts):
 
 
 @compiled(inline="always")
-def is_seam(x, y, first_kind, second_kind, place, spans, width):
-    """True if a surface goes on from the span x to y at a place across a seam, and they are large, or turn there.
+def is_seam(x, y, first_kind, second_kind, spans):
+    """True if a surface that goes on from the span x to y does so across a seam, and they are large, or turn there.
 
-    The kinds are the last numbers of their `names`, see `spans_loops.spans_of`; for `width` see `breaks`.
+    The kinds are the last numbers of their `names`, see `spans_loops.spans_of`. Without normals there are no seams.
     """
-    if len(width) == 0 or first_kind & 2 == 0 or second_kind & 1 == 0:
+    if spans.shape[1] == 6 or first_kind & 2 == 0 or second_kind & 1 == 0:
         return False
     if first_kind & second_kind & 4 != 0:
         return True
-    first, second, z = _rise(spans, x, place), _rise(spans, y, place), depth_at(spans, x, place)
-    step = width[0] + width[1] * z
-    return abs(first - second) * step > CREASE * (step * step + first * second)
-
-
-@compiled(inline="always")
-def _rise(spans, i, place):
-    """The slope of a span's depth along its gap at a place, a cell."""
-    return (spans[i, 3] - depth_at(spans, i, place) * spans[i, 5]) / (spans[i, 4] + spans[i, 5] * place)
+    return spans[x, 6] * spans[y, 6] + spans[x, 7] * spans[y, 7] + spans[x, 8] * spans[y, 8] < CREASE
 
 
 @loop
@@ -243,7 +235,6 @@ def breaks(
     ends,
     end_depth,
     inner,
-    width,
     rows,
     counts,
     whole,
@@ -259,7 +250,7 @@ def breaks(
         last: the gap after the last.
         gap: (M, 3), see `Gaps`.
         begins: (M + 1,) where the spans of each gap begin.
-        spans: (N, 6), see `spans_loops.spans_of`; those of a gap sorted by where they start.
+        spans: (N, 6) or (N, 9), see `spans_loops.spans_of`; those of a gap sorted by where they start.
         names: (N, 2) gap and triangle.
         parts: (N,) int32.
         seen: (H, W) int32, the parts seen at centres, or −1.
@@ -268,7 +259,6 @@ def breaks(
         ends: (M, 2, 2) int32 to fill: part and triangle of the samples at both centres; −1 where nothing is seen.
         end_depth: (M, 2) to fill: their depths.
         inner: distance of the samples that tell colours.
-        width: the width of a cell at a depth, `width[0] + width[1] * depth`; none if seams do not count.
         rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
         counts: (M,) to fill: the number of breaks of each gap.
         whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles
@@ -302,7 +292,7 @@ def breaks(
             stops, begun = x >= 0 and spans[x, 1] <= place + TOUCH, y >= 0 and spans[y, 0] >= place - TOUCH
             seamless = nearer < 0 and (x < 0 or stops) and (y < 0 or begun)
             seam = seamless and before == behind and x >= 0 and y >= 0
-            seam = seam and is_seam(x, y, names[x, 2], names[y, 2], place, spans, width)
+            seam = seam and is_seam(x, y, names[x, 2], names[y, 2], spans)
             if before == behind and (t == s or seamless) and not seam:
                 continue
             if nearer < 0 and not seam:

@@ -110,8 +110,8 @@ class Sheets(NamedTuple):
         arguments = *map(read_only, fronts), part_range, *mesh, self.keep != 0, met, joined
         parallel(sheets_loops.seams, height, *arguments, work=8 * joined[0].size)
 
-    def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Spans of triangles on gaps, (N, 3) int32 and (N, 6), see `spans_loops.spans_of`; their parts, (N,) int32."""
+    def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Spans of triangles on gaps, (N, 3) int32 and (N, 6) or (N, 9), see `spans_loops.spans_of`; their parts, (N,)."""
         from rts.outlines import spans_loops
 
         close = np.empty(len(self.seen), np.int8)
@@ -122,7 +122,7 @@ class Sheets(NamedTuple):
         triangles = np.flatnonzero(most)
         most = most[triangles]
         begins = np.cumsum(most) - most
-        names, spans = np.full((most.sum(), 3), -1, np.int32), np.empty((most.sum(), 6))
+        names, spans = np.full((most.sum(), 3), -1, np.int32), np.empty((most.sum(), 9 if seams else 6))
         mesh = self.rows, self.vertices, self.faces, self.beyond, self.clip, self.keep, self.seen
         arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))

@@ -38,12 +38,12 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     marks = np.empty_like(joined)
     parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, marks, work=fronts.part.size // 2)
     gaps = Gaps.of(marks)
-    begins, names, spans, parts = spans_on(gaps, sheets)
+    begins, names, spans, parts = spans_on(gaps, sheets, seams)
     count = len(gaps.gap)
     room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
     seen = *map(read_only, fronts), np.empty((count, 2, 2), np.int32), np.empty((count, 2))
-    known = gaps.gap, begins, spans, names, parts, *seen, INNER, width[: 2 * seams], rows, counts, whole, numbers
+    known = gaps.gap, begins, spans, names, parts, *seen, INNER, rows, counts, whole, numbers
     parallel(fronts_loops.breaks, count, *known, work=600 * count)
     count = counts.sum()
     gap, points, near = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
@@ -55,14 +55,16 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     return Breaks(gap, place, near, slope, ends, last, inner, beside, joined, triangles, tangent, away)
 
 
-def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def spans_on(
+    gaps: Gaps, sheets: Sequence[Sheets], seams: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Spans of all parts on gaps, gap after gap: where those of each begin (M + 1,); names, spans; parts (N,) int32.
 
     See `Sheets.spans`.
     """
     from rts.outlines import spans_loops
 
-    several = [sheet.spans(gaps) for sheet in sheets]
+    several = [sheet.spans(gaps, seams) for sheet in sheets]
     names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
     parallel(spans_loops.by_start, len(gaps.gap), begins, spans[:, 0], order, work=50 * len(order))

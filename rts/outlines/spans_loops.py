@@ -15,7 +15,7 @@ from rts.sampling.points_loops import corners_of, edge
 TINY = 1e-9
 """Shortest length of a span."""
 
-LARGE = 32.0
+LARGE = 8.0
 """Area in the image, in cells, from which on triangles are large."""
 
 SLACK = np.float32(0.01)
@@ -196,7 +196,8 @@ def spans_of(
         by_column: see `Gaps`.
         names: (N, 3) int32 to fill, of each span the gap, the triangle, and a sum: 1 if it starts at an edge that no
             other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; filled with −1.
-        spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d.
+        spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d. Or (N, 9), with the triangle's unit normal
+            on the side that is seen, in the proxy's space, where it starts or ends at such an edge.
     """
     corners, box, line = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2))
     for i in range(first, last):
@@ -206,6 +207,7 @@ def spans_of(
             continue
         size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
         large = 0 if abs(size) < 2 * LARGE else 4  # Those that are seen in part, too.
+        normal = _normal(t, sign, vertices, faces) if spans.shape[1] > 6 else (0.0, 0.0, 0.0)
         cut = _cut(t, clip, vertices, faces)
         for axis in range(2):
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
@@ -217,7 +219,19 @@ def spans_of(
                 least, most, start, end = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
                 on_line = table[n, low], table[n, high], 1 - axis
                 bounds = least, most, _is_open(beyond, t, start) + 2 * _is_open(beyond, t, end) + large
-                count = _add(t, on_line, bounds, gap, line, corners, names, spans, count)
+                count = _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count)
+
+
+@compiled(inline="always")
+def _normal(t, sign, vertices, faces):
+    """The unit normal of a triangle, on the side that the viewer sees if `sign` is that of its area in the image."""
+    a, b, c = vertices[faces[t, 0]], vertices[faces[t, 1]], vertices[faces[t, 2]]
+    ux, uy, uz = np.float64(b[0]) - a[0], np.float64(b[1]) - a[1], np.float64(b[2]) - a[2]
+    vx, vy, vz = np.float64(c[0]) - a[0], np.float64(c[1]) - a[1], np.float64(c[2]) - a[2]
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    size = np.sqrt(x * x + y * y + z * z)
+    size = (size if sign > 0 else -size) if size > 0 else 1.0
+    return x / size, y / size, z / size
 
 
 @compiled(inline="always")
@@ -227,11 +241,11 @@ def _is_open(beyond, t, edge):
 
 
 @compiled(inline="always")
-def _add(t, on_line, bounds, gap, line, corners, names, spans, count):
+def _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count):
     """Add the spans of a triangle on gaps of a line; returns `count`.
 
     `on_line` are the first gap, the one after the last, and the column of `gap` that tells where they begin; `bounds`
-    are where on the line the triangle is seen, from and to, and the last number of its `names`.
+    are where on the line the triangle is seen, from and to, and the last number of its `names`; `normal` is its own.
     """
     (first, last, column), (least, most, kind) = on_line, bounds
     for g in range(first, last if most - least > TINY else first):
@@ -240,6 +254,8 @@ def _add(t, on_line, bounds, gap, line, corners, names, spans, count):
         if min(end, 1.0) - max(start, 0.0) >= -TINY:
             names[count, 0], names[count, 1], names[count, 2] = g, t, kind
             _fill(spans, count, start, end, line, corners, gap[g, column] + 0.5)
+            if spans.shape[1] > 6:
+                spans[count, 6], spans[count, 7], spans[count, 8] = normal
             count += 1
     return count
 

@@ -29,7 +29,7 @@ def breaks_of_stacks(
         seams: as of `breaks_of_triangles`; at each there are two breaks in one place.
     """
     gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
-    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets, width[: 2 * seams])
+    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets, seams)
     gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
     joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
     inside, part = layers.part[0] >= 0, layers.part
@@ -73,13 +73,13 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 
 
 def _changes(
-    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
+    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], seams: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The changes of stacks along gaps; see `stacks_loops.changes`."""
     from rts.outlines import stacks_loops as loops
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
-    begins, names, spans, parts = spans_on(gaps, sheets)
+    begins, names, spans, parts = spans_on(gaps, sheets, seams)
     seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
@@ -92,9 +92,9 @@ def _changes(
         return np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
 
     known = begins, spans, names, parts, opaque, seen, depth, counts
-    parallel(loops.changes, count, *known, at, False, INNER, width, *filled(0), work=300 * count)
+    parallel(loops.changes, count, *known, at, False, INNER, *filled(0), work=300 * count)
     at = np.cumsum(counts) - counts
     result = filled(int(counts.sum()))
-    parallel(loops.changes, count, *known, at, True, INNER, width, *result, work=300 * count)
+    parallel(loops.changes, count, *known, at, True, INNER, *result, work=300 * count)
     whole, place, samples, places, sides = result
     return whole, place, samples, places, sides

@@ -4,7 +4,7 @@ A *run* is a surface along a gap: spans that follow one another, end to start. A
 the back does that it turns into. The stack at a place is the runs there, front to back. It changes where a run starts
 or ends, and where two runs pass through one another.
 
-Each gap works on tables of its own, copied from those of all spans: `own` (n, 8), the six columns of
+Each gap works on tables of its own, copied from those of all spans: `own` (n, 11), the columns of
 `spans_loops.spans_of`, then where a run starts and ends; and `of` (n, 8), integers. To pass an array on, threads count
 its references in turns, so that helpers take few, and none that is shared in their inmost loops.
 """
@@ -23,7 +23,7 @@ CLOSE = 1e-5
 SAME = 1e-4
 """Share of the depth by which a sample at a centre may differ from the run that it lies on."""
 
-LOW, HIGH = 6, 7
+LOW, HIGH = 9, 10
 """Columns of `own`: where a run starts, in the row of its first span, and where it ends, in that of its last."""
 
 PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE, EDGES = range(8)
@@ -39,14 +39,14 @@ def _alike(own, i, j, place):
 
 
 @compiled(inline="always")
-def _link(own, of, n, width):
+def _link(own, of, n, seams):
     """Fill in the columns AFTER and BEFORE of n spans. At seams a run ends, and the next one starts."""
     for i in range(n):
         for j in range(n):
             if i == j or of[j, BEFORE] >= 0 or of[i, PART] != of[j, PART] or not own[j, HIGH] > own[i, HIGH]:
                 continue
             if abs(own[j, LOW] - own[i, HIGH]) <= TOUCH and _alike(own, i, j, own[i, HIGH]):
-                if not is_seam(i, j, of[i, EDGES], of[j, EDGES], own[i, HIGH], own, width):
+                if not (seams and is_seam(i, j, of[i, EDGES], of[j, EDGES], own)):
                     of[i, AFTER], of[j, BEFORE] = j, i
                 break
 
@@ -303,9 +303,9 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
 
 
 @compiled(inline="always")
-def _fill_runs(g, n, own, of, opaque, seen, depth, knots, width):
+def _fill_runs(g, n, own, of, opaque, seen, depth, knots, seams):
     """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
-    _link(own, of, n, width)
+    _link(own, of, n, seams)
     for i in range(n):
         if of[i, BEFORE] >= 0:
             continue
@@ -399,7 +399,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
 
 @loop
 def changes(
-    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, width, whole,
+    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole,
     place_of, samples, places, sides,
 ):  # fmt: skip
     """Count the changes of stacks along gaps, or fill them in, in order.
@@ -410,7 +410,7 @@ def changes(
         first: the first gap.
         last: the gap after the last.
         begins: (M + 1,) where the spans of each gap begin.
-        spans: (N, 6), see `spans_loops.spans_of`.
+        spans: (N, 6) or (N, 9), see `spans_loops.spans_of`.
         names: (N, 3), see `spans_loops.spans_of`.
         parts: (N,) int32.
         opaque: bool, for each part.
@@ -420,7 +420,6 @@ def changes(
         at: (M,) where the changes of each gap begin; used if
         fill: True to fill in what follows, False to count.
         inner: distance of the samples that tell colours of what ends.
-        width: the width of a cell at a depth, `width[0] + width[1] * depth`; none if seams do not count.
         whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
             and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
@@ -432,19 +431,19 @@ def changes(
     longest, most_changes = 0, 0
     for g in range(first, last):
         longest, most_changes = max(longest, begins[g + 1] - begins[g]), max(most_changes, counts[g])
-    own, of = np.empty((longest, 8)), np.empty((longest, 8), np.int64)
+    own, of = np.empty((longest, 11)), np.empty((longest, 8), np.int64)
     stack, knots = np.empty(longest + 1, np.int64), np.empty(2 * longest + 1)
     enders = np.empty((most_changes, 2), np.int64)
     for g in range(first, last):
         n, base = begins[g + 1] - begins[g], at[g]
         for i in range(n):
             x = begins[g] + i
-            for c in range(6):
+            for c in range(spans.shape[1]):
                 own[i, c] = spans[x, c]
             own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
             of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
             of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE], of[i, EDGES] = -1, -1, 0, 0, names[x, 2]
-        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots, width), 0
+        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots, spans.shape[1] > 6), 0
         for i in range(n):
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))
