@@ -185,6 +185,8 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
 def _kind(before, behind, nearer, stops, starts):
     """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; −1, not at all.
 
+    Where two parts meet at an edge of both, the kind is SEAM.
+
     Args:
         before: the part before the place, or −1.
         behind: the part behind, or −1.
@@ -203,7 +205,7 @@ def _kind(before, behind, nearer, stops, starts):
     elif not stops:
         kind = 2
     elif before != behind:
-        kind = 0
+        kind = SEAM
     return kind
 
 

@@ -98,7 +98,8 @@ class Gaps(NamedTuple):
 
 
 SEAM = 3
-"""`Breaks.near` where a surface goes on across edges that its triangles do not share, so that colours may change."""
+"""`Breaks.near` where a surface goes on across edges that its triangles do not share, so that colours may change; and
+where two parts meet at an edge of both."""
 
 
 class Breaks(NamedTuple):

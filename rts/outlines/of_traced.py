@@ -16,6 +16,7 @@ from rts.arrays.engines import Context, engine_of, is_constant, is_traced, names
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import OF_SAMPLES, OF_SEGMENTS, ArraySpec, Cells, Outlines, Request, Sampled, Samples
+from rts.errors import InputWarning, warn
 from rts.outlines.found import Found, Told
 from rts.outlines.of_scene import most_breaks, with_outlines
 from rts.sampling.entries import is_batched
@@ -187,6 +188,8 @@ class _Call:
             kept.append(samples.replace(ids=samples.ids[:count], params=samples.params[:count], row=own))
         row = place[sampled.row]
         left = np.asarray(np.count_nonzero((sampled.row >= 0) & (row < 0)), np.int32)
+        if left:
+            warn(f"{left} samples find no room in capacity={capacity}; give the compiled program more", InputWarning)
         cells = Cells(row, np.where(row >= 0, sampled.depth, np.float32(0)), np.where(row >= 0, sampled.triangle, -1))
         return replace(sampled, samples=tuple(kept), cells=cells, overflow=sampled.overflow + left)
 

@@ -57,14 +57,16 @@ def ends_of(gap, place, near, parts, height, width):
         Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
         corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
         the sides leaves the front, −1 where it enters it, 0 where surfaces cross and at seams; the parts in front and
-        behind. Seams have a negative number for both, so that they are joined among themselves.
+        behind. Seams have a negative number for both, by their parts, so that they are joined among themselves.
     """
     square, along, ends = (
         np.empty(2 * len(gap), np.int64),
         np.empty(2 * len(gap)),
         np.empty((2 * len(gap), 5), np.int32),
     )
-    count = 0
+    count, most = 0, np.int32(1)
+    for b in range(len(gap)):
+        most = max(most, parts[b, 0] + 1, parts[b, 1] + 1)
     # Those on the sides 2 and 3, against the way of their gaps, come last and backwards: so that breaks in one place
     # are in order clockwise.
     for n in range(2 * len(gap)):
@@ -77,7 +79,8 @@ def ends_of(gap, place, near, parts, height, width):
         if near[b] == 1 or (near[b] == 2 and front > back):
             front, back = back, front
         if near[b] == SEAM:
-            front, back = -2 - front, -2 - front
+            front = -2 - min(front, back) * most - max(front, back)
+            back = front
         for first in range(2):
             # Above and below a row's gap, left and right of a column's.
             top, left = y - (row if first == 0 else 0), x - (1 - row if first == 0 else 0)

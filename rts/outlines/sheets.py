@@ -111,7 +111,7 @@ class Sheets(NamedTuple):
         parallel(sheets_loops.seams, height, *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Spans of triangles on gaps, (N, 3) int32 and (N, 6) or (N, 9), see `spans_loops.spans_of`; their parts, (N,)."""
+        """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
         from rts.outlines import spans_loops
 
         close = np.empty(len(self.seen), np.int8)

@@ -197,14 +197,22 @@ def test_samples_and_breaks_without_room_are_counted(monkeypatch):
     counts = [own.ids.shape[0] for own in rts.sample(parts(torch.tensor(np.asarray(poses))), CAMERA, SIZE).samples]
     whole = rts.sample(parts(torch.tensor(np.asarray(poses))), CAMERA, SIZE)
     cells = np.bincount(np.searchsorted(np.cumsum(counts), np.asarray(whole.row)[np.asarray(whole.row) >= 0], "right"))
-    few = jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE, capacity=50))(poses)
+    with pytest.warns(rts.errors.InputWarning, match="samples find no room in capacity=50"):
+        few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE, capacity=50))(poses))
     assert int(few.overflow) == np.maximum(cells - 50, 0).sum() > 0
     assert np.isfinite(np.asarray(rts.render_samples(few, parts(poses), CAMERA))).all()
     breaks = whole.outlines.place.shape[0]
     monkeypatch.setattr(of_traced, "most_breaks", lambda grid, capacity: 30)
-    few = jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE))(poses)
+    told = (
+        f"{breaks - 30} breaks of outlines find no room beside 30, .* give the compiled program capacity={4 * breaks}"
+    )
+    with pytest.warns(rts.errors.InputWarning, match=told):
+        few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE))(poses))
     assert int(few.overflow) == breaks - 30
-    several = jax.jit(jax.vmap(lambda p: rts.sample(parts(p), CAMERA, SIZE).overflow))(jax.numpy.stack([poses, poses]))
+    with pytest.warns(rts.errors.InputWarning, match=told):
+        several = jax.jit(jax.vmap(lambda p: rts.sample(parts(p), CAMERA, SIZE).overflow))(
+            jax.numpy.stack([poses, poses])
+        ).block_until_ready()
     assert several.tolist() == [breaks - 30] * 2
 
 
