@@ -56,7 +56,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     `rts.load_model` reads them.
 
     Welding may make vertices fewer than the file's. For data of your own, one row for each vertex of the
-    file, load with `weld=False`.
+    file, load with `weld=False`. So do for hard edges of a file without normals, as of an STL: welded, it is shaded
+    smooth.
 
     Args:
         path: the file. It may refer to files in its own folder only.

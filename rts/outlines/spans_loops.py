@@ -15,7 +15,7 @@ from rts.sampling.points_loops import corners_of, edge
 TINY = 1e-9
 """Shortest length of a span."""
 
-LARGE = 8.0
+LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
 
 SLACK = np.float32(0.01)
