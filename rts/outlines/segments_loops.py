@@ -482,6 +482,8 @@ def _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near):
             continue
         low, high = min(clock[other, 0], clock[other, 1]), max(clock[other, 0], clock[other, 1])
         crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)
+        for e in range(2):  # Those that begin in one place do not.
+            crosses &= abs(clock[s, e] - low) > TIE and abs(clock[s, e] - high) > TIE
         if crosses and other < s and step == 0 and hub[other] == 0:
             on = _crossing(s, other, origin, ties, place, corner)
             step = other - s if on >= 0 else 0
