@@ -180,19 +180,19 @@ class Points:
     def broken(self, layers: Fronts, most: int | None) -> _Broken:
         """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
         breaks, *others = self._breaks(layers, self._told.colors)
-        count = len(breaks.gap)
-        if most is None or count <= most:
-            return _Broken(breaks, *others, 0)
-        if self._told.colors:  # Outlines come before seams.
-            breaks, *others = self._breaks(layers, False)
-        left = count - min(most, len(breaks.gap))
-        warn(
-            f"{left} breaks of outlines find no room beside {most}, and edges there neither move nor are smooth; "
-            f"give the compiled program capacity={4 * count} or more",
-            InputWarning,
-        )
-        breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-        return _Broken(breaks, *(x[:most] for x in others), left)
+        count, left = len(breaks.gap), 0
+        if most is not None and count > most:
+            if self._told.colors:  # Outlines come before seams.
+                breaks, *others = self._breaks(layers, False)
+            left = count - min(most, len(breaks.gap))
+            warn(
+                f"{left} breaks of outlines find no room beside {most}, and edges there neither move nor are smooth; "
+                f"give the compiled program capacity={4 * count} or more",
+                InputWarning,
+            )
+            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
+            others = [x[:most] for x in others]
+        return _Broken(breaks, *others, left)
 
     def _breaks(
         self, layers: Fronts, seams: bool

@@ -45,17 +45,15 @@ class Edges(SummingSplatter):
     colors: Literal["outlines", "centers"] = "outlines"
 
     layers = 1
+    reads = frozenset({"outlines"})
     translucent = True
     any_channels = True
 
     def __post_init__(self):
         if self.colors not in ("outlines", "centers"):
             raise InputError(f"colors is {quoted(self.colors)}; expected 'outlines' or 'centers'")
-
-    @property
-    def reads(self) -> frozenset[str]:
-        """See `rts.Splatter`."""
-        return frozenset({"outlines", "colors at centers"} if self.colors == "centers" else {"outlines"})
+        if self.colors == "centers":
+            self.reads = frozenset({"outlines", "colors at centers"})
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
