@@ -265,7 +265,7 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
             own = Sheets(0, np.int32([0, 1]), vertices, faces, none, rows, clip, 0.0, seen, np.int8([2, 2]))
-            names, spans, _ = own.spans(Gaps.of(marks))
+            names, spans, _ = own.spans(Gaps.of(marks), True)
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
             assert np.isfinite(spans).all()

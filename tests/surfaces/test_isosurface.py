@@ -300,7 +300,9 @@ def test_breaks_without_room_in_a_table_are_left_out_and_counted():
 
         return map(np.asarray, own(jax.numpy.asarray(RADII["radii"])))
 
-    (none, seen, every, _), (left, still, fewer, image) = sampled(True), sampled(room)
+    none, seen, every, _ = sampled(True)
+    with pytest.warns(rts.errors.InputWarning, match="breaks of outlines find no room beside"):
+        left, still, fewer, image = sampled(room)
     assert (still == seen).all() and none == 0 and left == every - fewer > 0 < fewer and np.isfinite(image).all()
 
 
