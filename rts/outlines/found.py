@@ -129,7 +129,7 @@ def colored_at_centers(outlines: Outlines, row: Array, told: Told) -> Outlines:
     first, last = (xp.take(flat, at) for at in (y * width + x, (y + 1 - along) * width + x + along))
 
     def beside(of_breaks: Array, at_first: Array, at_last: Array) -> Array:
-        """What belongs to the surfaces (B, 2): at centres, or (B,) behind a break, which the next one has before it."""
+        """Entries (B, 2) of the surfaces beside breaks: those at centres, or (B,) behind this break or the last one."""
         before = xp.where(ends[:, 0], at_first, xp.roll(of_breaks, 1))
         return xp.stack([before, xp.where(ends[:, 1], at_last, of_breaks)], axis=-1)
 

@@ -213,9 +213,9 @@ def _kind(before, behind, nearer, stops, starts):
 def is_seam(x, y, first_kind, second_kind, spans):
     """True if a surface that goes on from the span x to y does so across a seam, and they are large, or turn there.
 
-    The kinds are the last numbers of their `names`, see `spans_loops.spans_of`. Without normals there are no seams.
+    The kinds are the last numbers of their `names`, see `spans_loops.spans_of`.
     """
-    if spans.shape[1] == 6 or first_kind & 2 == 0 or second_kind & 1 == 0:
+    if first_kind & 2 == 0 or second_kind & 1 == 0:
         return False
     if first_kind & second_kind & 4 != 0:
         return True
@@ -253,7 +253,7 @@ def breaks(
         gap: (M, 3), see `Gaps`.
         begins: (M + 1,) where the spans of each gap begin.
         spans: (N, 6) or (N, 9), see `spans_loops.spans_of`; those of a gap sorted by where they start.
-        names: (N, 2) gap and triangle.
+        names: (N, 3), see `spans_loops.spans_of`.
         parts: (N,) int32.
         seen: (H, W) int32, the parts seen at centres, or −1.
         triangle: (H, W) int32, and their triangles.

@@ -197,7 +197,7 @@ class Points:
     def _breaks(
         self, layers: Fronts, seams: bool
     ) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """All breaks, and the other arrays of `_Broken`; of one layer with those at seams, if they are wanted."""
+        """All breaks, and the other arrays of `_Broken`; with those at seams, if they are wanted."""
         every, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
         known, count = None not in every, len(layers.part)
         sheets = list({id(sheet): sheet for sheet in every}.values())

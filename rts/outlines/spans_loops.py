@@ -195,11 +195,13 @@ def spans_of(
         by_row: see `Gaps`.
         by_column: see `Gaps`.
         names: (N, 3) int32 to fill, of each span the gap, the triangle, and a sum: 1 if it starts at an edge that no
-            other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; filled with −1.
+            other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; or 0 if `spans` have no normals.
+            Filled with −1.
         spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d. Or (N, 9), with the triangle's unit normal
             on the side that is seen, in the proxy's space, where it starts or ends at such an edge.
     """
     corners, box, line = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2))
+    seams = spans.shape[1] > 6
     for i in range(first, last):
         t, count = triangles[i], begins[i]
         sign = corners_of(t, rows, vertices, faces, corners)
@@ -207,7 +209,7 @@ def spans_of(
             continue
         size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
         large = 0 if abs(size) < 2 * LARGE else 4  # Those that are seen in part, too.
-        normal = _normal(t, sign, vertices, faces) if spans.shape[1] > 6 else (0.0, 0.0, 0.0)
+        normal = _normal(t, sign, vertices, faces) if seams else (0.0, 0.0, 0.0)
         cut = _cut(t, clip, vertices, faces)
         for axis in range(2):
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
@@ -218,7 +220,7 @@ def spans_of(
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
                 least, most, start, end = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
                 on_line = table[n, low], table[n, high], 1 - axis
-                bounds = least, most, _is_open(beyond, t, start) + 2 * _is_open(beyond, t, end) + large
+                bounds = least, most, seams * (_is_open(beyond, t, start) + 2 * _is_open(beyond, t, end) + large)
                 count = _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count)
 
 

@@ -39,14 +39,14 @@ def _alike(own, i, j, place):
 
 
 @compiled(inline="always")
-def _link(own, of, n, seams):
+def _link(own, of, n):
     """Fill in the columns AFTER and BEFORE of n spans. At seams a run ends, and the next one starts."""
     for i in range(n):
         for j in range(n):
             if i == j or of[j, BEFORE] >= 0 or of[i, PART] != of[j, PART] or not own[j, HIGH] > own[i, HIGH]:
                 continue
             if abs(own[j, LOW] - own[i, HIGH]) <= TOUCH and _alike(own, i, j, own[i, HIGH]):
-                if not (seams and is_seam(i, j, of[i, EDGES], of[j, EDGES], own)):
+                if not is_seam(i, j, of[i, EDGES], of[j, EDGES], own):
                     of[i, AFTER], of[j, BEFORE] = j, i
                 break
 
@@ -303,9 +303,9 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
 
 
 @compiled(inline="always")
-def _fill_runs(g, n, own, of, opaque, seen, depth, knots, seams):
+def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
     """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
-    _link(own, of, n, seams)
+    _link(own, of, n)
     for i in range(n):
         if of[i, BEFORE] >= 0:
             continue
@@ -443,7 +443,7 @@ def changes(
             own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
             of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
             of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE], of[i, EDGES] = -1, -1, 0, 0, names[x, 2]
-        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots, spans.shape[1] > 6), 0
+        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0
         for i in range(n):
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))

@@ -77,7 +77,7 @@ class RenderSettings:
         return self.splatter is not None and "outlines" in self.splatter.reads
 
     def told(self, scenes: Sequence[Scene] | None) -> Told:
-        """What samples beside outlines have to tell of views of a scene; with None, of any shaders and derivatives."""
+        """The tasks of samples beside outlines in views of a scene; with None, for any shaders and derivatives."""
         centers = self.splatter is not None and "colors at centers" in self.splatter.reads
         return Told(centers=centers) if scenes is None else Told.of(scenes, centers)
 
