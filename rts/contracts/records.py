@@ -197,84 +197,58 @@ class Request:
     entry: Any = None
 
 
-REACH = 6
-"""The most rows from a segment to the one in `Outlines.hub`."""
-
-OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "hub", "beyond", "corner", "pull"})
-"""The fields of `Outlines` that have a row for each segment."""
-
-OF_SAMPLES = ("rows", "inner", "pair", "stack")
-"""The fields of `Outlines` that hold indices of samples."""
+OF_SAMPLES = ("color_sample", "motion_sample", "motion_colors")
+"""The fields of `Stencil` that hold indices of samples, if it has no stacks."""
 
 
 @record()
-class Outlines:
-    """Outlines between the centres of cells: places where a front ends, joined into segments. They have no derivative.
+class Stencil:
+    """An image as a sparse matrix times colours, and its derivative as another one times motions.
 
-    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
-    another surface, or across a seam, is a break. Four neighbouring centres are the corners of a square; breaks on its
-    sides are joined into segments.
+        image    of a cell  =  colour of its front sample  +  Σ weight · colour
+        d image  of a cell  =  the same of d colours  +  Σ (weight · d position) (colour − other colour)  −  ∇C · d position
+
+    The sums are over entries, which only cells beside outlines have. ∇C, the slope of colours at the cell, is the mean
+    of the differences from and to the next cells that are joined to it; the last term is that of its front sample. What
+    is multiplied by d position is constant. The weights of a cell, with the 1 of its front sample, are at least 0, and
+    their sum is at most 1.
+
+    Entries are sorted by cell. Those of weight 0 at the end have no effect. An index −1 stands for nothing, of colour 0.
 
     Attributes:
-        place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
-        gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
-        rows: (B, 2) int32, indices of the last samples before and behind each break, along its gap, or −1. Breaks move
-            as they do.
-        points: (B, 2) float64, the places of these samples along the gap.
-        inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
-            colours: in the last hair before an outline normals may turn away, and colours with them. All are −1 where
-            each part has one colour; and where nothing moves, since `rows` and `points` are then those of colours.
-        pair: (B, 2) int32, indices of two samples on the ray of the last sample of the surface that ends, beside its
-            deepest point, or −1: the break moves as their mean (`RaySurface.deepest`). A single sample does not tell
-            how a kink of a field moves.
-        near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
-            surfaces pass through one another; at seams 0, where a surface goes on and its colours may change.
-        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
-        ends: (B, 2) bool: is this the gap's first break, and its last?
-        square: (S, 2) int32, the first corner (y, x) of each segment's square.
-        ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
-            the other. −1 in second place if a break is alone. A segment from a break to itself has no effect.
-        square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
-        hub: (S,) int32, how many rows farther on there is the segment, of the same square, that the outline of a lone
-            break ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `beyond` has the
-            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is about the motion
-            of that segment's corner. Lone breaks with no segment beside them have the first of them as their hub.
-        beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
-        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
-        pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
-            is the motion of the corner.
-        joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y? Of several
-            layers, do all that are seen?
-        stack: (B, 2, K) int32, indices of samples of the K layers before and behind each break, front to back, or −1.
-            Then `near` is about the layer that ends there, `rows` has a sample only where it is, or two where layers
-            cross, and `inner` has no meaning. None for one layer.
-        stack_points: (B, 2, K) float64, the places of these samples along the gap; None for one layer.
+        joined: (2, H, W) bool: does the surface in front of each cell go on to the next one's, along x and along y? Of
+            several layers, do all that are seen?
+        color_cell: (E,) int32, the cell, y · W + x, of each entry of colours.
+        color_sample: (E,) int32, the sample whose colour it weighs.
+        color_weight: (E,) of θ's dtype.
+        motion_cell: (F,) int32, the cell of each entry of motions.
+        motion_sample: (F,) int32, the sample that moves.
+        motion_weight: (F, 3) of θ's dtype: cells per cell along x and y, and per unit of depth.
+        motion_colors: (F, 2) int32, the samples of both colours, or −1.
+        stacks: (R, K) int32, where light passes through some part: samples of further stacks, front to back, or −1.
+            Then colours are composites, and `color_sample` and `motion_colors` count those of all H · W cells, then
+            these. None if all is opaque.
     """
 
-    place: Array
-    gap: Array
-    rows: Array
-    points: Array
-    inner: Array
-    pair: Array
-    near: Array
-    slope: Array
-    ends: Array
-    square: Array
-    ties: Array
-    square_sides: Array
-    hub: Array
-    beyond: Array
-    corner: Array
-    pull: Array
     joined: Array
-    stack: Array | None = None
-    stack_points: Array | None = None
+    color_cell: Array
+    color_sample: Array
+    color_weight: Array
+    motion_cell: Array
+    motion_sample: Array
+    motion_weight: Array
+    motion_colors: Array
+    stacks: Array | None = None
 
-    def with_rows(self, f: Callable[[Array], Array]) -> Outlines:
-        """The outlines with `f` applied to all indices of samples: (B, 2), and (B, 2, K) of stacks."""
-        indices = {name: getattr(self, name) for name in OF_SAMPLES}
-        return replace(self, **{name: f(x) for name, x in indices.items() if x is not None})
+    def with_samples(self, f: Callable[[Array], Array]) -> Stencil:
+        """The stencil with `f` applied to all indices of samples."""
+        names = ("motion_sample", "stacks") if self.stacks is not None else OF_SAMPLES
+        return replace(self, **{name: f(getattr(self, name)) for name in names})
+
+    def samples(self) -> list[Array]:
+        """All arrays that hold indices of samples."""
+        names = ("motion_sample", "stacks") if self.stacks is not None else OF_SAMPLES
+        return [getattr(self, name) for name in names]
 
 
 @record(static=("supersample", "apron"))
@@ -291,8 +265,8 @@ class Sampled(_OnCells):
             Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        outlines: outlines between centres, for splatters that read them, or None. Their samples are rows of each part
-            behind those of cells.
+        stencil: areas and fluxes beside outlines, for splatters that read them, or None. Its samples are rows of each
+            part behind those of cells.
     """
 
     samples: tuple[Samples, ...]
@@ -300,7 +274,7 @@ class Sampled(_OnCells):
     overflow: Array
     supersample: int = 1
     apron: int = 2
-    outlines: Outlines | None = None
+    stencil: Stencil | None = None
 
     @property
     def one_part(self) -> bool:
@@ -332,7 +306,7 @@ class Splats(_OnCells):
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         border: cells at each side that splat into the image but are no part of it.
         opaque: a promise that alpha is 1 at all samples.
-        outlines: outlines between centres, if the splatter reads them; arrays of the positions' engine.
+        stencil: areas and fluxes beside outlines, if the splatter reads them; arrays of the positions' engine.
     """
 
     positions: Array
@@ -340,4 +314,4 @@ class Splats(_OnCells):
     cells: Cells
     border: int = 0
     opaque: bool = True
-    outlines: Outlines | None = None
+    stencil: Stencil | None = None

@@ -54,7 +54,7 @@ class StageTime(NamedTuple):
         name: "sample", "outlines", "evaluate and shade", "splat", or "gradient", the whole of backward.
         first: milliseconds of the first call, in which loops may be compiled and structures built.
         later: the median of later calls, milliseconds.
-        rows: number of samples, breaks of outlines, splats or pixels; for a gradient, of numbers differentiated by.
+        rows: number of samples, entries of the stencil, splats or pixels; for a gradient, of numbers differentiated by.
         megabytes: of the arrays that it makes; 0 for a gradient.
     """
 
@@ -154,8 +154,8 @@ def profile(
         stages.append(StageTime(SAMPLING, first, later, _rows(bare), _megabytes(bare)))
     sampled, whole_first, whole_later = timed(lambda: sampled_with(settings))
     if stages:
-        found, before = sampled.outlines, stages[0]
-        count = 0 if found is None else found.place.shape[0]
+        found, before = sampled.stencil, stages[0]
+        count = 0 if found is None else found.color_cell.shape[0] + found.motion_cell.shape[0]
         spent = max(whole_first - before.first, 0.0), max(whole_later - before.later, 0.0)
         stages.append(StageTime(OUTLINES, *spent, count, _megabytes(found)))
     else:

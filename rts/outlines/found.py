@@ -1,87 +1,154 @@
-"""The record of outlines as they are found on the host, before the samples of all parts are counted."""
+"""The record of outlines as they are found on the host, and the stencil that follows from them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from operator import attrgetter
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
-from rts.arrays.trees import Array
-from rts.contracts.records import ArraySpec, Outlines
+from rts.contracts.records import ArraySpec, Stencil
 from rts.sampling.entries import is_still
 from rts.sampling.scene import Scene
 
 
-class Found(NamedTuple):
-    """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
+class Outlines(NamedTuple):
+    """Outlines between the centres of cells: places where a front ends, joined into segments. Host arrays.
+
+    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
+    another surface, or across a seam, is a break. Four neighbouring centres are the corners of a square; breaks on its
+    sides are joined into segments.
 
     Attributes:
-        rows: (B, 6) int32, for each break the two samples that tell motions, the two that tell colours (−1 if only one
-            of both is told, see `Told`), and the pair, counted in their part. Of K layers (B, 2 + K + 1): the two last
-            samples, and those of the stack there.
+        rows: (B, 6) int32, for each break two samples that tell motions, before and behind it along its gap; two that
+            tell colours (−1 if only one of both is told, see `Told`), since in the last hair before an outline normals
+            may turn away, and colours with them; and a pair on the ray of the last sample of the surface that ends,
+            beside its deepest point, whose mean moves as the outline (`RaySurface.deepest`): a single sample does not
+            tell how a kink of a field moves. They are counted in their part; −1 for none. Of K layers
+            (B, 2 + K + 1): the two last samples, only where the layer that ends is, or two where layers cross; and
+            those of the stack there.
         parts: of the shape of `rows`, int32, their parts, or −1.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
-        places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
-        left: () int32, number of breaks left out for want of room.
+        place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
+        gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
+        near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
+            surfaces pass through one another; at seams 0, where a surface goes on and its colours may change. Of
+            several layers it is about the one that ends there.
+        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
+        ends: (B, 2) bool: is this the gap's first break, and its last?
+        square: (S, 2) int32, the first corner (y, x) of each segment's square.
+        ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
+            the other. −1 in second place if a break is alone. Segments of one square follow one another.
+        square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        hub: (S,) int32, how many rows farther on there is the segment, of the same square, that the outline of a lone
+            break ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `beyond` has the
+            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is about the motion
+            of that segment's corner. Lone breaks with no segment beside them have the first of them as their hub.
+        beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
+        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
+        pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
+            is the motion of the corner.
+        joined: (2, H, W) bool, see `Stencil`.
+        left: number of breaks left out for want of room.
     """
 
-    rows: Array
-    parts: Array
-    sides: Array
-    places: Array
-    place: Array
-    gap: Array
-    points: Array
-    near: Array
-    slope: Array
-    ends: Array
-    square: Array
-    ties: Array
-    square_sides: Array
-    hub: Array
-    beyond: Array
-    corner: Array
-    pull: Array
-    joined: Array
-    left: Array
+    rows: np.ndarray
+    parts: np.ndarray
+    sides: np.ndarray
+    place: np.ndarray
+    gap: np.ndarray
+    near: np.ndarray
+    slope: np.ndarray
+    ends: np.ndarray
+    square: np.ndarray
+    ties: np.ndarray
+    square_sides: np.ndarray
+    hub: np.ndarray
+    beyond: np.ndarray
+    corner: np.ndarray
+    pull: np.ndarray
+    joined: np.ndarray
+    left: int
 
-    @staticmethod
-    def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
-        """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
-        integers, ends, (width, entries, of_sides) = np.int32, 2 * most, columns(layers)
-        breaks = [ArraySpec((most, width), integers, packed=True)] * 2
-        breaks += [ArraySpec((most, 2, of_sides), integers, packed=True), ArraySpec((most, entries), real, packed=True)]
-        breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
-        breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
-        breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
-        pairs = ArraySpec((ends, 2), integers, packed=True)
-        segments = [pairs, pairs, pairs, ArraySpec((ends,), integers, packed=True), pairs]
-        segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
-        return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
+    def stencil(self, starts: np.ndarray, row: np.ndarray, told: Told, real: Any) -> Stencil:
+        """The areas and fluxes beside outlines.
 
-    def outlines(self, rows: Array) -> Outlines:
-        """The outlines, with `rows` counted over all parts."""
-        last = rows[:, :2]
-        named = {"rows": last, "inner": rows[:, 2:4], "pair": rows[:, 4:]}
-        if self.sides.shape[-1]:
-            named = {"rows": last, "inner": last, "pair": 0 * last - 1, **self._stacks(rows[:, 2:])}
-        return Outlines(**dict(zip(_SHARED, _shared_of(self), strict=True)) | named)
+        Args:
+            starts: (P,) int32, for each part the index, over all parts, of the first of its samples beside breaks.
+            row: (K, H, W) int32, the samples in cells, counted likewise.
+            told: what samples tell.
+            real: the dtype of weights.
+        """
+        from rts.outlines import stencil_loops as loops
 
-    def _stacks(self, rows: Array) -> dict[str, Array]:
-        """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
-        xp, shape, there = namespace(rows), self.sides.shape, self.sides >= 0
-        first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
-        at = xp.reshape(xp.where(there, first + self.sides, 0), (-1,))
-        stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, self.places))
-        return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
+        rows = np.where(self.rows >= 0, self.rows + starts[self.parts], np.int32(-1))
+        last, none = rows[:, :2], np.full((len(rows), 2), -1, np.int32)
+        if self.sides.shape[2]:
+            stack = np.take_along_axis(rows[:, None, 2:], np.maximum(self.sides, 0), axis=2)
+            stack = np.where(self.sides >= 0, stack, np.int32(-1))
+            samples = last, last, none, stack
+        else:
+            samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
+        of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
+        of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
+        arrays = *of_breaks, *of_segments, self.joined, np.ascontiguousarray(row, np.int32)
+        colors, motions, stacks = loops.entries(*arrays, np.empty(0, real))
+        return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
+
+    def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
+        """The samples (B, 2) that tell motions, and those that tell colours, or −1 for the former.
+
+        Colours may be those of centres (H, W), on surfaces that reach these; of other pieces, one sample's.
+        """
+        last, inner = rows[:, :2], rows[:, 2:4]
+        if not told.centers:
+            return last, inner
+        y, x, along = self.gap.T
+        first, second = front[y, x], front[y + 1 - along, x + along]
+        # Behind the last break, or before this one.
+        before = np.where(self.ends[:, 0], first, np.roll(last[:, 1], 1))
+        colors = np.stack([before, np.where(self.ends[:, 1], second, last[:, 1])], axis=1)
+        return (last, colors) if told.motions else (colors, inner)
+
+    def beside(self, count: int) -> np.ndarray:
+        """The number (P,) int32 of rows up to the last one that is named, of each of `count` parts."""
+        ends = np.zeros(count + 1, np.int32)  # The last one is that of no part.
+        np.maximum.at(ends, self.parts.reshape(-1), self.rows.reshape(-1) + np.int32(1))
+        return ends[:count]
 
 
-_SHARED = tuple(f.name for f in fields(Outlines) if f.name in Found._fields)
-_shared_of = attrgetter(*_SHARED)
+COLORS, MOTIONS = 16, 32
+"""Entries of colours and of motions, for each break, for which programs of fixed shapes have room; about 9 and 15 are
+in use."""
+
+
+def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
+    """Specs of the fields of a stencil with room for at most so many breaks."""
+    colors, motions = COLORS * most, MOTIONS * most * (1 if layers == 1 else 2)
+    shapes = [((2, *size), np.bool_, False), ((colors,), np.int32, True), ((colors,), np.int32, True)]
+    shapes += [((colors,), real, True), ((motions,), np.int32, True), ((motions,), np.int32, True)]
+    shapes += [((motions, 3), real, True), ((motions, 2), np.int32, True)]
+    if layers > 1:
+        shapes.append((((2 + layers) * most, layers), np.int32, True))
+    return [ArraySpec(*one) for one in shapes]
+
+
+def fits(stencil: Stencil, most: int | None) -> bool:
+    """True if a stencil has room in `specs` of so many breaks; None for any."""
+    if most is None:
+        return True
+    layers = 1 if stencil.stacks is None else stencil.stacks.shape[1]
+    room = specs(most, stencil.joined.shape[1:], None, layers)
+    return all(x.shape[0] <= spec.shape[0] for x, spec in zip(arrays_of(stencil), room, strict=True))
+
+
+def arrays_of(stencil: Stencil) -> list[Any]:
+    """The arrays of a stencil, in the order of `specs`."""
+    return [x for x in (getattr(stencil, name) for name in FIELDS) if x is not None]
+
+
+FIELDS = tuple(field.name for field in fields(Stencil))
 
 
 class Told(NamedTuple):
@@ -109,37 +176,3 @@ class Told(NamedTuple):
         if layers > 1:
             return layers + 3
         return 4 if self.colors and self.motions and not self.centers else 2
-
-
-def colored_at_centers(outlines: Outlines, row: Array, told: Told) -> Outlines:
-    """Outlines whose colours are those of centres, on surfaces that reach these; of other pieces, one sample's.
-
-    Outlines where light passes through are returned as they are.
-
-    Args:
-        outlines: those of `Found`, without samples that centres stand for.
-        row: (K, H, W) int32, the samples at centres.
-        told: what samples tell; with `centers`, or outlines are returned as they are.
-    """
-    if not told.centers or outlines.stack is not None:
-        return outlines
-    xp, width, ends, rows = namespace(row), row.shape[-1], outlines.ends, outlines.rows
-    y, x, along = (outlines.gap[:, i] for i in range(3))
-    flat = xp.reshape(row[0, ...], (-1,))
-    first, last = (xp.take(flat, at) for at in (y * width + x, (y + 1 - along) * width + x + along))
-
-    def beside(of_breaks: Array, at_first: Array, at_last: Array) -> Array:
-        """Entries (B, 2) of the surfaces beside breaks: those at centres, or (B,) behind this break or the last one."""
-        before = xp.where(ends[:, 0], at_first, xp.roll(of_breaks, 1))
-        return xp.stack([before, xp.where(ends[:, 1], at_last, of_breaks)], axis=-1)
-
-    colors = beside(rows[:, 1], first, last)
-    if told.motions:
-        return replace(outlines, inner=colors)
-    behind = outlines.points[:, 1]
-    return replace(outlines, rows=colors, points=beside(behind, xp.zeros_like(behind), xp.ones_like(behind)))
-
-
-def columns(layers: int) -> tuple[int, int, int]:
-    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `Found`."""
-    return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)

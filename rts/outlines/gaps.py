@@ -103,7 +103,7 @@ where two parts meet at an edge of both."""
 
 
 class Breaks(NamedTuple):
-    """Breaks, those of a gap in order along it. Host arrays; see `rts.contracts.records.Outlines`.
+    """Breaks, those of a gap in order along it. Host arrays; see `rts.outlines.found.Outlines`.
 
     Attributes:
         gap: (B, 3) int32.

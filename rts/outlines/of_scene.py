@@ -1,4 +1,4 @@
-"""Outlines of a sampled scene, and the samples beside them: where values are traced, by one call to the host."""
+"""The stencil of a sampled scene, and the samples beside outlines: where values are traced, by one call to the host."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rts.arrays.engines import Context, engine_of, is_traced, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
+from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Found, Told, colored_at_centers
-from rts.outlines.gaps import Fronts
+from rts.outlines.found import Told, arrays_of, fits, specs
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
 from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
+from rts.sampling.picture import renumbered
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -34,7 +34,7 @@ def with_outlines(
     capacity: int | None = None,
     most: int | None = None,
 ) -> Sampled:
-    """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
+    """Samples at cells' centres with `Sampled.stencil` and the samples beside breaks.
 
     Where light passes through, the outlines are those of all layers that it reaches; else those of the first layer.
 
@@ -50,9 +50,9 @@ def with_outlines(
     Warns:
         InputWarning: a sampler cannot sample single points.
     """
-    cells, inputs = sampled.cells, None
+    inputs, real = None, real_of(scene)
     if all(scene.opaque):
-        sampled = replace(sampled, cells=cells.first(1))
+        sampled = replace(sampled, cells=sampled.cells.first(1))
     if scene.context.engine.differentiates:
         # Functions of surfaces want the arrays that they are given.
         known = [
@@ -63,32 +63,64 @@ def with_outlines(
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
         room = most_breaks(grid, capacity) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, room, capacity, told, inputs)
-    else:
-        centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
-        (here,), more = found_in_views([Points.of(scene, grid, inputs_of(scene), told)], [centres], most)
-        specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
-        arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
-        # Engines that compile eager operations anew for each shape pad them.
-        found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
-    xp, samples, moved, first = namespace(found.rows), [], [], 0
-    for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        moved.append(first + of_cells.ids.shape[-2])
+        return _found_on_host(sampled, scene, grid, room, capacity, told, inputs)
+    points, count = Points.of(scene, grid, inputs_of(scene), told), most
+    cells = map_leaves(host_value, sampled.cells)
+    centres = at_centres(cells, sampled.samples)
+    while True:
+        (found,), more = found_in_views([points], [centres], count)
+        samples, places = _joined(sampled.samples, more, found.beside(len(more)))
+        row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
+        stencil = found.stencil(places.beside, row, told, real)
+        if fits(stencil, most) or not count:
+            break
+        count = min(count, len(found.place)) // 2
+    if len(samples) > 1:
+        row = engine_of(sampled.row).constant(row, sampled.row)
+        sampled = replace(sampled, cells=replace(sampled.cells, row=row))
+    # Engines that compile eager operations anew for each shape pad them.
+    arrays, layers = arrays_of(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
+    results = engine_of(sampled.row).call_host(lambda _: arrays, specs(0, grid.size, real, layers), sampled.row)
+    overflow = sampled.overflow + np.int32(found.left)
+    cells = replace(sampled.cells, triangle=None)
+    return replace(sampled, samples=samples, cells=cells, stencil=Stencil(*results), overflow=overflow)
+
+
+class _Places(NamedTuple):
+    """Where the samples of each part lie among those of all.
+
+    Attributes:
+        counts: (P,) the numbers of samples at centres.
+        centres: (P,) int32, the index of each part's first sample at a centre.
+        beside: (P,) int32, that of its first sample beside a break.
+    """
+
+    counts: np.ndarray
+    centres: np.ndarray
+    beside: np.ndarray
+
+    def of_centres(self) -> np.ndarray:
+        """The index of each sample at a centre, counted over all of these; then −1."""
+        shifts = self.centres - np.cumsum(self.counts) + self.counts
+        at = np.arange(self.counts.sum()) + np.repeat(shifts, self.counts)
+        return np.append(at, -1).astype(np.int32)
+
+
+def _joined(
+    centres: Sequence[Samples], beside: Sequence[Samples], used: Sequence[Any]
+) -> tuple[tuple[Samples, ...], _Places]:
+    """The samples of each part, those at centres and then those beside breaks, of which so many are `used`."""
+    samples, counts, firsts, first = [], [], [], 0
+    for of_cells, extra, last in zip(centres, beside, used, strict=True):
         whole = in_one_table([of_cells, extra])
         if engine_of(whole.ids).padded(whole.ids):
-            whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
+            whole = _without_gaps(whole, of_cells, last)
         samples.append(whole)
+        counts.append(of_cells.ids.shape[-2])
+        firsts.append(first)
         first += whole.ids.shape[-2]
-    rows = found.rows
-    behind: Any = moved[0]
-    if len(moved) > 1:
-        owners = xp.reshape(xp.clip(found.parts, 0), (-1,))
-        behind = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
-        behind = xp.reshape(behind, rows.shape)
-    rows = xp.where(rows >= 0, rows + behind, rows)
-    overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
-    outlines = colored_at_centers(found.outlines(rows), cells.row, told)
-    return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+    counts, firsts = np.array(counts), np.array(firsts, np.int32)
+    return tuple(samples), _Places(counts, firsts, firsts + counts.astype(np.int32))
 
 
 def most_breaks(grid: Grid, capacity: int | None) -> int:
@@ -96,15 +128,15 @@ def most_breaks(grid: Grid, capacity: int | None) -> int:
     return max(8 * sum(grid.size), (capacity or 0) // 4)
 
 
-def _without_gaps(whole: Samples, of_cells: Samples, beside: Array) -> Samples:
+def _without_gaps(whole: Samples, of_cells: Samples, beside: Any) -> Samples:
     """Samples, those `of_cells` of cells and then further ones, in which unused rows repeat one in use.
 
-    `beside` (B, R) holds the numbers of the further ones in use, or −1.
+    `beside` is the number of the further ones in use.
     """
     xp, count, constant = namespace(whole.ids), of_cells.ids.shape[-2], engine_of(whole.ids).constant
     rows = constant(np.arange(whole.ids.shape[-2], dtype=np.int32), whole.ids)
-    used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (of_cells.row, beside))
-    there = (rows < used) | ((rows >= count) & (rows < count + last))
+    used = xp.max(xp.concat([xp.reshape(of_cells.row, (-1,)), 0 * rows[:1] - 1])) + 1
+    there = (rows < used) | ((rows >= count) & (rows < count + beside))
     return taken_rows(whole, xp.where(there, rows, xp.where(used > 0, 0, count)))
 
 
@@ -116,53 +148,68 @@ def _found_on_host(
     capacity: int | None,
     told: Told,
     inputs: Tree,
-) -> tuple[Found, list[Samples]]:
-    """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    owners, layers = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0]
+) -> Sampled:
+    """See `with_outlines`; by a call to the host, with room for `most` breaks, and with the `inputs` from there."""
+    owners, layers, real = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0], real_of(scene)
     room = [
         _Room.of(part, sampler, samples, layers, told, most, capacity)
         for part, sampler, samples in zip(scene.parts, scene.samplers, sampled.samples, strict=True)
     ]
-
-    def entered(arrays: Sequence[np.ndarray]) -> tuple[Scene, Grid, Fronts, list[Tree]]:
-        """Scene, cells, what is seen at their centres, and the inputs of proxies, on the host."""
-        values = iter(arrays)
-        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), inputs)
-        of_parts, camera, cells = known
-        pairs = zip(scene.parts, of_parts, strict=True)
-        parts = [replace(part, theta=theta, transform=None) for part, (_, theta, _) in pairs]
-        cameras = [seen for seen, *_ in of_parts]
-        here = scene._replace(parts=parts, cameras=cameras, context=Context(engine_of(), None))
-        return here, Grid(camera, grid.size), at_centres(cells, sampled.samples), [x for *_, x in of_parts]
+    # The host does not know how many samples beside breaks there will be: there is room for the most between parts.
+    counts = np.array([samples.ids.shape[-2] for samples in sampled.samples])
+    total, parts = counts.sum(), len(counts)
+    each = (2**31 - 1 - total) // parts if most is None else max(own.rows for own in room)
+    beside = (total + each * np.arange(parts)).astype(np.int32)
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
-        here, own_grid, centres, known = entered(arrays)
-        points, count = Points.of(here, own_grid, known, told), most
-        (found,), more = found_in_views([points], [centres], count)
-        while count and not all(own.holds(samples) for own, samples in zip(room, more, strict=True)):
-            count //= 2
+        values = iter(arrays)
+        of_parts, camera, cells = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), inputs)
+        pairs = zip(scene.parts, of_parts, strict=True)
+        here = scene._replace(
+            parts=[replace(part, theta=theta, transform=None) for part, (_, theta, _) in pairs],
+            cameras=[seen for seen, *_ in of_parts],
+            context=Context(engine_of(), None),
+        )
+        points = Points.of(here, Grid(camera, grid.size), [x for *_, x in of_parts], told)
+        centres, count = at_centres(cells, sampled.samples), most
+        while True:
             (found,), more = found_in_views([points], [centres], count)
-        arrays_of = []
+            stencil = found.stencil(beside, cells.row, told, real)
+            if not count or (fits(stencil, most) and all(own.holds(x) for own, x in zip(room, more, strict=True))):
+                break
+            count = min(count, len(found.place)) // 2
+        results = [*arrays_of(stencil), found.beside(parts), found.left]
         for part, samples, tables in zip(here.parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = (
                 part.surface.evaluate(part.theta, replace(samples, gbuffer_names=None)) if "gbuffer" in kinds else {}
             )
-            arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
-        return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
+            results += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
+        return [np.asarray(x, spec.dtype) for x, spec in zip(results, of_results, strict=True)]
 
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
-    specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
+    of_results = specs(most or 0, grid.size, real, layers)
+    fields = len(of_results)
+    of_results += [ArraySpec((parts,), np.int32), ArraySpec((), np.int32)]
     for tables, own in zip(owners, room, strict=True):
         for (kind, name), x in tables.items():
             dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
             count = own.tables.get(name, own.rows) if kind == "tables" else own.rows
-            specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
+            of_results.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     at_once = all(map(_samples_at_once, scene.parts, scene.samplers))
     call = OnAllCores(host) if at_once else host
-    results = iter(engine_of(sampled.row, *operands).call_host(call, specs, *operands))
-    found = Found(*islice(results, len(Found._fields)))
-    return found, [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
+    results = iter(engine_of(sampled.row, *operands).call_host(call, of_results, *operands))
+    stencil, used, left = Stencil(*islice(results, fields)), next(results), next(results)
+    more = [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
+    samples, places = _joined(sampled.samples, more, [used[part] for part in range(parts)])
+    cells = replace(sampled.cells, triangle=None)
+    if parts > 1:
+        before = np.concatenate([np.cumsum(counts) - counts, beside])
+        shifts = np.concatenate([places.centres, places.beside]) - before
+        starts, shifts = before[None].astype(np.int32), shifts[None].astype(np.int32)
+        stencil = stencil.with_samples(lambda rows: renumbered(rows, starts, shifts))
+        cells = replace(cells, row=renumbered(cells.row, starts, shifts))
+    return replace(sampled, samples=samples, cells=cells, stencil=stencil, overflow=sampled.overflow + left)
 
 
 def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
@@ -222,19 +269,3 @@ def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samp
     of = {kind: {name: x for (k, name), x in arrays.items() if k == kind} for kind in ("", "tables", "gbuffer")}
     gbuffer = None if samples.gbuffer is None else of["gbuffer"]
     return replace(samples, **of[""], tables=of["tables"], gbuffer=gbuffer)
-
-
-def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
-    """The cells of a scene whose parts have got further rows behind their own."""
-    if sampled.one_part:
-        return replace(sampled.cells, triangle=None)
-    row, counts = sampled.row, [before.ids.shape[-2] for before in sampled.samples]
-    more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
-    shift, engine = np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), engine_of(row)
-    known = value_of(row)
-    if known is not None and not is_batched(row):
-        place = np.append(np.arange(len(shift), dtype=np.int32) + shift, np.int32(-1))
-        return replace(sampled.cells, row=engine.constant(place[known], row), triangle=None)
-    xp, shift = namespace(row), engine.constant(shift, row)
-    moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
-    return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)

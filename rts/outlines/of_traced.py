@@ -6,7 +6,7 @@ Under `vmap` items that show small meshes whole are drawn side by side in one pi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,9 +15,9 @@ import numpy as np
 from rts.arrays.engines import Context, engine_of, is_constant, is_traced, namespace, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
-from rts.contracts.records import OF_SAMPLES, OF_SEGMENTS, ArraySpec, Cells, Outlines, Request, Sampled, Samples
+from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Found, Told
+from rts.outlines.found import Told, arrays_of, fits, specs
 from rts.outlines.of_scene import most_breaks, with_outlines
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
@@ -86,7 +86,7 @@ class _Call:
             attribute_specs(surface, part.reads, theta, bounds, scene.context.like)
             for part, surface, theta in zip(scene.parts, self._surfaces, self._constant, strict=True)
         ]
-        self._outlines = _specs(self._most or 0, grid.size, real_of(scene), kept)
+        self._stencil = specs(self._most or 0, grid.size, real_of(scene), kept)
         self._cells = kept, *grid.size
 
     def sampled(self, operands: Sequence[Array]) -> Sampled:
@@ -103,14 +103,14 @@ class _Call:
             samples.append(Samples(ids, params, own, 0 * count, gbuffer=gbuffer, gbuffer_names=part.reads))
             lengths.append(length)
         row, depth, overflow = (next(results) for _ in range(3))
-        outlines = Outlines(**dict(zip(self._outlines, results, strict=True)))
+        stencil = Stencil(*results)
         starts = np.arange(len(lengths), dtype=np.int64) * self._rows
         shifts = np.cumsum([0, *lengths[:-1]]) - starts
         if shifts.any():
             starts, shifts = starts[None].astype(np.int32), shifts[None].astype(np.int32)
             row = renumbered(row, starts, shifts)
-            outlines = outlines.with_rows(lambda rows: renumbered(rows, starts, shifts))
-        return Sampled(tuple(samples), Cells(row, depth), overflow, outlines=outlines)
+            stencil = stencil.with_samples(lambda rows: renumbered(rows, starts, shifts))
+        return Sampled(tuple(samples), Cells(row, depth), overflow, stencil=stencil)
 
     def _specs(self) -> list[ArraySpec]:
         specs = []
@@ -120,7 +120,7 @@ class _Call:
             specs += [ArraySpec((self._rows, i), np.int32, True), ArraySpec((self._rows, p), np.float32, True)]
             specs += [spec._replace(packed=True) for spec in attributes.values()]
         specs += [ArraySpec(self._cells, np.int32), ArraySpec(self._cells, np.float32), ArraySpec((), np.int32)]
-        return [*specs, *self._outlines.values()]
+        return [*specs, *self._stencil]
 
     def _entered(self, arrays: Sequence[np.ndarray]) -> tuple[Scene, Grid]:
         """The scene on the host, and its cells, from operands."""
@@ -149,8 +149,8 @@ class _Call:
                 chunk = alike[first : first + most]
                 together = [view for index in chunk if (view := views[index]) is not None]
                 for index, sampled in zip(chunk, self._side_by_side(together), strict=True):
-                    outlines = sampled.outlines
-                    if self._most is None or (outlines is not None and len(outlines.place) <= self._most):
+                    assert sampled.stencil is not None
+                    if fits(sampled.stencil, self._most):
                         found[index] = sampled
         results = dict(zip(found, self._results(list(found.values())), strict=True))
         return [results.get(index) for index in range(len(items))]
@@ -163,15 +163,15 @@ class _Call:
         sampled = scene.joints[0].sampled(picture.size, self._layers, request.triangles, request.uniform)
         here = scene._replace(context=self._context)
         sampled = with_outlines(self._limited(sampled), here, grid, self._told)
-        assert sampled.outlines is not None
+        assert sampled.stencil is not None
         count = len(self._scene.parts)
         tables = [sampled.samples[first : first + count] for first in range(0, len(sampled.samples), count)]
         starts = np.cumsum([0, *(sum(len(part.ids) for part in of_view) for of_view in tables)])[:-1]
-        outlines = _split(sampled.outlines, picture)
-        for of_view, start, place, own in zip(tables, starts, picture.places(), outlines, strict=True):
+        stencils = _split(sampled.stencil, picture)
+        for of_view, start, place, own in zip(tables, starts, picture.places(), stencils, strict=True):
             row, depth = (x[:, *place] for x in (sampled.row, sampled.depth))
-            own = own.with_rows(partial(_moved, shift=-start))
-            yield replace(sampled, samples=of_view, cells=Cells(_moved(row, -start), depth), outlines=own)
+            own = own.with_samples(partial(_moved, shift=-start))
+            yield replace(sampled, samples=of_view, cells=Cells(_moved(row, -start), depth), stencil=own)
 
     def _limited(self, sampled: Sampled) -> Sampled:
         """Samples at centres, at most `capacity` of each part; those of the last layers are left out."""
@@ -194,13 +194,13 @@ class _Call:
         return replace(sampled, samples=tuple(kept), cells=cells, overflow=sampled.overflow + left)
 
     def _results(self, items: Sequence[Sampled]) -> list[list[np.ndarray]]:
-        """The results of items: for each part a count, tables and attributes, then cells, overflow and outlines."""
+        """The results of items: for each part a count, tables and attributes, then cells, overflow and stencil."""
         attributes = [self._attributes_of(index, items) for index in range(len(self._scene.parts))]
         found = []
         for b, sampled in enumerate(items):
             results, sizes = [], [len(samples.ids) for samples in sampled.samples]
-            outlines: Any = sampled.outlines
-            beside = np.concatenate([getattr(outlines, n).reshape(-1) for n in OF_SAMPLES if n in self._outlines])
+            stencil: Any = sampled.stencil
+            beside = np.concatenate([x.reshape(-1) for x in stencil.samples()])
             owners = np.searchsorted(np.cumsum(sizes), beside[beside >= 0], side="right")
             named = np.bincount(owners, minlength=len(sizes)) > 0
             for samples, of_part, is_named in zip(sampled.samples, attributes, named.tolist(), strict=True):
@@ -210,9 +210,8 @@ class _Call:
             moved = np.append(np.arange(sum(sizes)) + np.repeat(shifts, sizes), -1).astype(np.int32)
             row = sampled.row
             if len(sizes) > 1:
-                row, outlines = moved[row], outlines.with_rows(moved.__getitem__)
-            of_outlines = [getattr(outlines, name) for name in self._outlines]
-            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *of_outlines]
+                row, stencil = moved[row], stencil.with_samples(moved.__getitem__)
+            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *arrays_of(stencil)]
             found.append(results)
         return found
 
@@ -234,49 +233,45 @@ class _Call:
         return [list(of_item) for of_item in zip(*split, strict=True)]
 
 
-def _specs(most: int, size: tuple[int, int], real: Any, layers: int) -> dict[str, ArraySpec]:
-    """Specs of the fields of outlines of at most so many breaks, each of which ends at most two segments."""
-    of_found = dict(zip(Found._fields, Found.specs(most, size, real, layers), strict=True))
-    rows = ArraySpec((most, 2), np.int32, packed=True)
-    specs = {"rows": rows, "inner": rows, "pair": rows}
-    if layers > 1:
-        stack = most, 2, layers
-        specs |= {"stack": ArraySpec(stack, np.int32, packed=True), "stack_points": ArraySpec(stack, real, packed=True)}
-    names = [field.name for field in fields(Outlines)]
-    specs |= {name: spec for name, spec in of_found.items() if name in names and name not in specs}
-    return specs
-
-
 def _moved(rows: Array, shift: int) -> np.ndarray:
     """Indices (…) int32 of rows, moved by `shift`; −1 stays."""
     return np.where(rows >= 0, rows + np.int32(shift), np.int32(-1))
 
 
-def _split(outlines: Outlines, picture: Picture) -> list[Outlines]:
-    """The outlines of each of B views of a picture, on the host: places and indices counted in the view.
+def _split(stencil: Stencil, picture: Picture) -> list[Stencil]:
+    """The stencils of each of B views of a picture, on the host: cells and stacks counted in the view."""
+    (height, width), across, whole = picture.view, picture.across, picture.size
+    count, stacks = whole[0] * whole[1], stencil.stacks
 
-    No break or segment lies in two views.
-    """
-    (height, width), corners = picture.view, picture.corners()[:, ::-1]
-    of_break, of_segment = (
-        x[:, 0] // height * picture.across + x[:, 1] // width for x in (outlines.gap, outlines.square)
-    )
-    breaks, segments = (np.argsort(x, kind="stable") for x in (of_break, of_segment))
-    per_view = [np.bincount(x, minlength=picture.views) for x in (of_break, of_segment)]
-    counts, ends = map(np.cumsum, per_view)
-    number = np.empty(len(breaks) + 1, np.int32)
-    number[breaks] = np.arange(len(breaks)) - (counts - per_view[0])[of_break[breaks]]
-    number[-1] = -1
-    gap, square = np.array(outlines.gap), outlines.square - corners[of_segment]
-    gap[:, :2] -= corners[of_break]
-    moved = {"gap": gap, "square": square, "ties": number[outlines.ties], "beyond": number[outlines.beyond]}
-    split = {}
-    for name in (field.name for field in fields(outlines)):
-        whole = moved.get(name, getattr(outlines, name))
-        if name != "joined" and whole is not None:
-            order, bounds = (segments, ends) if name in OF_SEGMENTS else (breaks, counts)
-            split[name] = np.split(whole[order], bounds[:-1])
-    return [
-        Outlines(**{name: x[b] for name, x in split.items()}, joined=outlines.joined[:, *place])
-        for b, place in enumerate(picture.places())
-    ]
+    def placed(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The views of cells of the picture, and their numbers there."""
+        y, x = np.divmod(cell, whole[1])
+        return y // height * across + x // width, y % height * width + x % width
+
+    def by_view(x: np.ndarray, order: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
+        return np.split(x[order], np.searchsorted(views[order], np.arange(1, picture.views)))
+
+    (of_color, color_cell), (of_motion, motion_cell) = placed(stencil.color_cell), placed(stencil.motion_cell)
+    color_sample, motion_colors, own_stacks = stencil.color_sample, stencil.motion_colors, [None] * picture.views
+    if stacks is not None:
+        # Each stack is one of the view whose entries name it; nothing names the others.
+        owner = np.zeros(len(stacks), np.int64)
+        for named, views in ((color_sample, of_color), *((motion_colors[:, i], of_motion) for i in (0, 1))):
+            owner[named[named >= count] - count] = views[named >= count]
+        order = np.argsort(owner, kind="stable")
+        own_stacks = by_view(stacks, order, owner)
+        number = np.empty(len(stacks), np.int64)
+        number[order] = np.concatenate([np.arange(len(x)) for x in own_stacks])
+
+        def composites(named: np.ndarray) -> np.ndarray:
+            inside = np.where(named < 0, -1, placed(np.clip(named, 0, count - 1))[1])
+            stack = number[np.clip(named - count, 0, None)] if len(number) else inside
+            return np.where(named < count, inside, height * width + stack).astype(np.int32)
+
+        color_sample, motion_colors = composites(color_sample), composites(motion_colors)
+    orders = [np.argsort(views, kind="stable") for views in (of_color, of_motion)]
+    colors = color_cell.astype(np.int32), color_sample, stencil.color_weight
+    motions = motion_cell.astype(np.int32), stencil.motion_sample, stencil.motion_weight, motion_colors
+    fields = [by_view(x, orders[0], of_color) for x in colors] + [by_view(x, orders[1], of_motion) for x in motions]
+    joined = [stencil.joined[:, *place] for place in picture.places()]
+    return [Stencil(*of_view) for of_view in zip(joined, *fields, own_stacks, strict=True)]

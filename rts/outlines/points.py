@@ -16,7 +16,7 @@ from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Found, Told
+from rts.outlines.found import Outlines, Told
 from rts.outlines.gaps import SEAM, Breaks, Fronts, Oracle, find_breaks
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
@@ -37,7 +37,7 @@ from rts.scene.camera import Camera
 
 def found_in_views(
     views: Sequence[Points], layers: Sequence[Fronts], most: int | None = None
-) -> tuple[list[Found], list[Samples]]:
+) -> tuple[list[Outlines], list[Samples]]:
     """Outlines of each view between what is seen at centres (K, H, W), of at most `most` breaks; samples of each part.
 
     Samples of several views lie on triangles. They are one table for each part, view after view.
@@ -80,7 +80,7 @@ class _Broken(NamedTuple):
         points: (B, R, 2), where they are.
         triangles: (B, R), on which they are; −1 where none is known.
         numbers: (B, R), how many layers of the same part are in front; 0 where triangles are known.
-        sides: see `Found.sides`.
+        sides: see `Outlines.sides`.
         left: number of breaks left out.
     """
 
@@ -137,22 +137,18 @@ class Points:
         """The joint that begins with a part, if any."""
         return next((joint for joint in self._scene.joints if joint.first == part), None)
 
-    def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Found:
+    def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Outlines:
         """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
-        breaks, parts, points, _, _, sides, left = broken
+        breaks, parts, _, _, _, sides, left = broken
         layered = sides.shape[-1] > 0
         if not layered:
             pairs, of_pairs = self._pairs(breaks, samples)
             rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
-        first = breaks.gap[:, 1::-1] + 0.5
-        place = ((breaks.place - first) * along).sum(-1)
-        places = ((points - first[:, None]) * along[:, None]).sum(-1)
-        entries = places[:, 2:] if layered else places[:, :0]
+        place = ((breaks.place - breaks.gap[:, 1::-1] - 0.5) * along).sum(-1)
         near = np.where(breaks.near == SEAM, 0, breaks.near)  # There both surfaces move alike.
-        of_breaks = breaks.gap, places[:, :2], near, breaks.slope, breaks.ends
-        segments = joined(breaks, layered)
-        return Found(rows, parts, sides, entries, place, *of_breaks, *segments, breaks.joined, np.int32(left))
+        of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
+        return Outlines(rows, parts, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
 
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).

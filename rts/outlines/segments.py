@@ -11,7 +11,7 @@ from rts.outlines.gaps import Breaks
 
 
 class Segments(NamedTuple):
-    """Segments of outlines; see `rts.contracts.records.Outlines`. Host arrays.
+    """Segments of outlines; see `rts.outlines.found.Outlines`. Host arrays.
 
     Attributes:
         square: (S, 2) int32.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.contracts.records import REACH
 from rts.outlines.gaps import SEAM
 
 LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
@@ -35,6 +34,9 @@ ALIKE = 1e-6
 
 TIE = 1e-4
 """Difference of distances, in cells, that does not tell which of two outlines another one ends at: it is rounding."""
+
+REACH = 6
+"""The most rows from a segment to its hub."""
 
 MOST_ALIKE = 4
 """The most breaks in one place: a centre is the end of so many gaps."""

@@ -225,7 +225,7 @@ def render_samples(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
     splatter = check_splatter(splatter)
-    if "outlines" in splatter.reads and sampled.outlines is None:
+    if "outlines" in splatter.reads and sampled.stencil is None:
         raise InputError(
             f"the samples have no outlines, which {splatter!r} reads; give it to rts.sample, too, or take another"
         )
@@ -235,7 +235,7 @@ def render_samples(
             f"{splatter.reach + 1}; give it to rts.sample, too"
         )
     if "outlines" not in splatter.reads:
-        sampled = _narrowed(replace(sampled, outlines=None), apron - splatter.reach - 1)
+        sampled = _narrowed(replace(sampled, stencil=None), apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
     context = scene.context_with(sampled, background)
     return over_background(splatted(sampled, scene, scene.camera, context, splatter), background)

@@ -197,9 +197,9 @@ def _front_depth(splats: Splats) -> Array:
     at = xp.take(splats.positions, xp.reshape(xp.where(there, row, 0), (-1,)), axis=0)
     at = xp.reshape(at, (*row.shape, 3))
     depth = xp.where(there, at[..., 2], 0.0)
-    if splats.outlines is None:
+    if splats.stencil is None:
         return depth
-    still, joined = stopped(depth), splats.outlines.joined
+    still, joined = stopped(depth), splats.stencil.joined
     for axis in (0, 1):
         rise = xp.where(joined[axis, ...], xp.roll(still, -1, axis=1 - axis) - still, 0.0)
         before, behind = joined[axis, ...], xp.roll(joined[axis, ...], 1, axis=1 - axis)

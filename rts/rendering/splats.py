@@ -10,7 +10,7 @@ import numpy as np
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats
+from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats, Stencil
 from rts.contracts.result_checks import check_splats
 from rts.errors import InputError
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
@@ -37,9 +37,8 @@ def to_splats(
     height, width, apron = *sampled.row.shape[1:], sampled.apron
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
     sampled = owned(sampled, sampled.row, context)
-    beside = None if sampled.outlines is None else sampled.outlines.rows
     positions, rgba = concatenated(
-        *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, beside)
+        *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, sampled.stencil)
     )
     return splats_of(sampled, parts, positions, rgba, context, border=apron)
 
@@ -59,11 +58,11 @@ def splats_of(
 ) -> Splats:
     """The splats of samples with these positions and colours."""
     cells = replace(sampled.cells, depth=None, triangle=None)
-    outlines = context_of(positions, rgba).constants(sampled.outlines)
+    stencil = context_of(positions, rgba).constants(sampled.stencil)
     if not context.engine.owns(rgba):
         cells = context_of(positions, rgba).constants(cells)
     opaque = all(p.shader.opaque for p in parts)
-    return Splats(positions, rgba, cells, border, opaque, outlines)
+    return Splats(positions, rgba, cells, border, opaque, stencil)
 
 
 def _positions_and_colors(
@@ -73,7 +72,7 @@ def _positions_and_colors(
     camera: Camera,
     grid: Grid,
     context: Context,
-    beside: Array | None = None,
+    stencil: Stencil | None = None,
 ) -> tuple[list[Array], list[Array]]:
     """Positions (N, 3) and colours (N, C + 1) of the samples of each part, all of one engine.
 
@@ -84,7 +83,7 @@ def _positions_and_colors(
         camera: the camera of the whole image, which shaders see.
         grid: the cells of the samples, and their camera.
         context: the engine to compute with, and an exemplar of the results.
-        beside: integers, the indices of samples beside outlines, behind those of cells; None without outlines.
+        stencil: names the samples beside outlines, behind those of cells; None without outlines.
     """
     inputs, engine = of_inputs(context), context.engine
     world_camera = grid.camera.replace(view=inputs.constants(grid.camera.view))
@@ -95,8 +94,8 @@ def _positions_and_colors(
         local = evaluate(part, samples, inputs)
         local_camera = world_camera.within(transform)
         add_footprint(part, samples, local, local_camera, grid.size, inputs)
-        padded = beside is not None and engine.padded(samples.row) and not _has_own_rows(samples)
-        used = all_in_use(samples, inputs, beside, first) if padded else samples
+        padded = stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
+        used = all_in_use(samples, inputs, stencil, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
         positions.append(context.constants(local_camera.project(on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
@@ -113,21 +112,25 @@ def _has_own_rows(samples: Samples) -> bool:
     return samples.row.shape[-2:] == (1, samples.ids.shape[-2])
 
 
-def all_in_use(samples: Samples, context: Context, beside: Array | None, first: int) -> Samples:
+def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, first: int) -> Samples:
     """The samples with cells of their own, one a row, so that no row passes for unused; or all do, if none is in use.
 
     Args:
         samples: the samples of a part.
         context: of their arrays.
-        beside: see `_positions_and_colors`; None if some row is in use.
+        stencil: see `_positions_and_colors`; None if some row is in use.
         first: the index of the part's first sample.
     """
     xp, count = namespace(samples.row), samples.ids.shape[-2]
     every = context.constants(np.arange(count, dtype=np.int32)[None, None])
-    if beside is None:
+    if stencil is None:
         return replace(samples, cells=replace(samples.cells, row=every))
-    rows: Array = context.constants(beside)
-    there = xp.any(samples.row >= 0) | xp.any((rows >= first) & (rows < first + count))
+    there = xp.any(samples.row >= 0)
+    for named, weights in ((stencil.color_sample, stencil.color_weight), (stencil.motion_sample, stencil.motion_weight)):
+        rows, weights = context.constants(named), context.constants(weights)
+        weights = xp.reshape(weights, (rows.shape[0], -1))
+        # Entries of weight 0 fill up the room.
+        there = there | xp.any((rows >= first) & (rows < first + count) & xp.any(weights != 0, axis=1))
     return replace(samples, cells=replace(samples.cells, row=xp.where(there, every, -1)))
 
 

@@ -60,14 +60,14 @@ def has_full_stacks(sampled: Sampled, opaque: Sequence[bool]) -> bool:
     Beside the outline of something opaque there may be more than at any centre of a cell.
 
     Args:
-        sampled: the samples, with outlines.
+        sampled: the samples, with a stencil.
         opaque: for each part, whether no light passes through it.
     """
-    outlines, layers = sampled.outlines, sampled.row.shape[-3]
-    stack = None if outlines is None or outlines.stack is None else value_of(outlines.stack)
-    if stack is None or stack.ndim != 3 or layers >= LAYER_LIMIT:
+    stencil, layers = sampled.stencil, sampled.row.shape[-3]
+    stacks = None if stencil is None or stencil.stacks is None else value_of(stencil.stacks)
+    if stacks is None or stacks.ndim != 2 or layers >= LAYER_LIMIT:
         return False
-    last = stack[:, :, -1]
+    last = stacks[:, -1]
     passes = ~np.repeat(opaque, [one.ids.shape[-2] for one in sampled.samples])
     return bool(passes[last[last >= 0]].any())
 

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.contracts.records import Outlines
+from rts.contracts.records import Stencil
 
 SIDE = 1024
 """Largest number of cells along each side of a picture: float32 places samples there to 1/16000 of a cell."""
@@ -104,37 +103,57 @@ def renumbered(rows: Array, starts: np.ndarray, shifts: np.ndarray) -> Array:
     return moved
 
 
-def outlines_side_by_side(
-    views: Sequence[Outlines], picture: Picture, starts: np.ndarray, shifts: np.ndarray
-) -> Outlines:
-    """The outlines of several views as those of their picture: breaks and segments, view after view.
+def stencils_side_by_side(
+    views: Sequence[Stencil], picture: Picture, starts: np.ndarray, shifts: np.ndarray
+) -> Stencil:
+    """The stencils of several views as that of their picture: entries and stacks, view after view.
 
     Args:
-        views: the outlines of each view.
+        views: the stencils of each view.
         picture: the layout of the views.
         starts: (B, P) the first row of each part in a view.
         shifts: (B, P) by how much the rows of these parts move in the picture.
     """
-    xp, first, joined = namespace(views[0].place), views[0], {}
-    for name in (field.name for field in fields(Outlines) if getattr(first, field.name) is not None):
-        of_views = [getattr(view, name) for view in views]
-        joined[name] = picture.laid_out(xp.stack(of_views), False) if name == "joined" else xp.concat(of_views)
-    whole, constant = Outlines(**joined), engine_of(first.place).constant
-    counts = np.array([(view.place.shape[0], view.square.shape[0]) for view in views], np.int32)
-    of_break, of_segment = (np.repeat(np.arange(len(views)), count) for count in counts.T)
-    corners = np.insert(picture.corners()[:, ::-1], 2, 0, axis=1).astype(np.int32)
-    before = np.cumsum(counts[:, :1], axis=0, dtype=np.int32) - counts[:, :1]
+    xp, engine, (height, width) = namespace(views[0].joined), engine_of(views[0].joined), picture.view
+    across, cells = picture.size[1], picture.size[0] * picture.size[1]
+    corners = (picture.corners() @ [1, across]).astype(np.int32)
 
-    def of_samples(rows: Array) -> Array:
-        return renumbered(rows, starts[of_break], shifts[of_break])
+    def whole(name: str) -> Array:
+        return xp.concat([getattr(view, name) for view in views])
 
-    def of_breaks(ties: Array) -> Array:
-        return renumbered(ties, 0 * before[of_segment], before[of_segment])
+    def of_views(name: str, values: np.ndarray) -> np.ndarray:
+        """Values (B, ...) for each entry of its view."""
+        return np.repeat(values, [getattr(view, name).shape[0] for view in views], axis=0)
 
-    return replace(
-        whole.with_rows(of_samples),
-        gap=whole.gap + constant(corners[of_break], whole.gap),
-        square=whole.square + constant(corners[of_segment, :2], whole.square),
-        ties=of_breaks(whole.ties),
-        beyond=of_breaks(whole.beyond),
-    )
+    def placed(cell: Array, corner: np.ndarray) -> Array:
+        """Cells of views, whose first cells are `corner`, as those of the picture."""
+        line = cell // width
+        return cell + line * (across - width) + engine.constant(corner, cell)
+
+    def moved(name: str) -> Array:
+        return renumbered(whole(name), of_views(name, starts), of_views(name, shifts))
+
+    cell = {name: placed(whole(name), of_views(name, corners)) for name in ("color_cell", "motion_cell")}
+    if views[0].stacks is None:
+        colors = {name: moved(name) for name in ("color_sample", "motion_colors")}
+    else:
+        before = np.cumsum([0, *(view.stacks.shape[0] for view in views if view.stacks is not None)])[:-1]
+
+        def composites(name: str) -> Array:
+            """Composites of cells and stacks of views as those of the picture."""
+            named = whole(name)
+            shape = -1, *[1] * (named.ndim - 1)
+            corner, first = (of_views(name, x).astype(np.int32).reshape(shape) for x in (corners, before))
+            stack = named + engine.constant(first + np.int32(cells - height * width), named)
+            inside = xp.where(named < 0, named, placed(named, corner))
+            return xp.where(named < height * width, inside, stack)
+
+        colors = {name: composites(name) for name in ("color_sample", "motion_colors")}
+    fields = {**cell, **colors, "motion_sample": moved("motion_sample")}
+    fields |= {name: whole(name) for name in ("color_weight", "motion_weight")}
+    for kind in ("color", "motion"):
+        order = xp.argsort(fields[f"{kind}_cell"])
+        for name in (name for name in fields if name.startswith(kind)):
+            fields[name] = xp.take(fields[name], order, axis=0)
+    joined = picture.laid_out(xp.stack([view.joined for view in views]), False)
+    return Stencil(joined, **fields, stacks=None if views[0].stacks is None else moved("stacks"))

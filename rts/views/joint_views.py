@@ -10,7 +10,7 @@ import numpy as np
 from rts.arrays.engines import Context, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
-from rts.contracts.records import Cells, Outlines, Sampled, Samples
+from rts.contracts.records import Cells, Sampled, Samples
 from rts.outlines.of_scene import with_outlines
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, real_of
@@ -52,15 +52,15 @@ def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Vie
         [table for table, at in zip(sampled.samples, places, strict=True) if at == n] for n in range(max(numbers))
     ]
     samples = tuple(map(_in_one_table, tables))
-    cells, outlines = replace(sampled.cells, triangle=None), sampled.outlines
+    cells, stencil = replace(sampled.cells, triangle=None), sampled.stencil
     if max(numbers) > 1:
         order = np.argsort(places, kind="stable")
         starts = np.empty(len(sizes), np.int64)
         starts[order] = np.cumsum(sizes[order]) - sizes[order]
         moved = np.arange(sizes.sum()) + np.repeat(starts - (np.cumsum(sizes) - sizes), sizes)
         cells = replace(cells, row=_moved(cells.row, moved))
-        outlines = None if outlines is None else _renumbered(outlines, moved)
-    sampled = replace(sampled, samples=samples, cells=cells, outlines=outlines)
+        stencil = None if stencil is None else stencil.with_samples(lambda rows: _moved(rows, moved))
+    sampled = replace(sampled, samples=samples, cells=cells, stencil=stencil)
     return with_counts(sampled, picture, tuple(counts))
 
 
@@ -72,11 +72,6 @@ def _in_one_table(samples: Sequence[Samples]) -> Samples:
     whole = in_one_table(samples)
     row = np.arange(whole.ids.shape[0], dtype=np.int32)[None, None]
     return replace(whole, cells=Cells(engine_of(whole.ids).constant(row, whole.ids)))
-
-
-def _renumbered(outlines: Outlines, moved: np.ndarray) -> Outlines:
-    """Outlines of samples whose rows have `moved`."""
-    return outlines.with_rows(lambda rows: _moved(rows, moved))
 
 
 def _moved(rows: Array, moved: np.ndarray) -> Array:

@@ -9,18 +9,17 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
-from rts.outlines.found import Found, colored_at_centers
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_scene import real_of
 from rts.outlines.points import Points, at_centres, found_in_views
 from rts.sampling.entries import host_value, inputs_of
-from rts.sampling.picture import outlines_side_by_side
+from rts.sampling.picture import stencils_side_by_side
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.views.sampled_views import Sampling, Views, with_counts
 
 
 def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
-    """The samples of views, none of them traced, with `Sampled.outlines` and the samples beside breaks.
+    """The samples of views, none of them traced, with `Sampled.stencil` and the samples beside breaks.
 
     Outlines are found view by view, on all cores. Samples beside breaks are taken for all views at once, and put behind
     those of their view.
@@ -36,7 +35,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
     samples, counts, moved, cells, start = [], [], [], sampled.cells, 0
-    rows = [np.full(of.rows.shape, -1, np.int32) for of in found]
+    rows, none = [of.rows.copy() for of in found], np.zeros(len(sampled.samples), np.int32)
     for part, (samples_of_part, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count, here = samples_of_part.ids.shape[0], [(of.parts == part) & (of.rows >= 0) for of in found]
         beside = np.array([np.count_nonzero(x) for x in here])
@@ -53,12 +52,13 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
             at[x] = start + place[count + of.rows[x]]
         start += len(order)
     cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)), triangle=None)
-    specs = Found.specs(0, grids[0].size, real_of(scenes[0]), len(sampled.row))
-    nowhere = np.zeros((len(found), 1), np.int32)
-    found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
-    outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = colored_at_centers(outlines_side_by_side(outlines, picture, nowhere, nowhere), host_value(cells.row), told)
-    sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
+    row, real, nowhere = host_value(cells.row), real_of(scenes[0]), np.zeros((len(found), 1), np.int32)
+    stencils = [
+        of._replace(rows=at).stencil(none, np.ascontiguousarray(row[:, *place]), told, real)
+        for of, at, place in zip(found, rows, picture.places(), strict=True)
+    ]
+    joint = stencils_side_by_side(stencils, picture, nowhere, nowhere)
+    sampled = replace(sampled, samples=tuple(samples), cells=cells, stencil=joint)
     return with_counts(sampled, picture, tuple(counts))
 
 

@@ -26,7 +26,7 @@ from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.merging import merge
 from rts.sampling.packing import pack_fragments
-from rts.sampling.picture import Picture, outlines_side_by_side, renumbered
+from rts.sampling.picture import Picture, stencils_side_by_side, renumbered
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import in_one_table
@@ -196,7 +196,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     """One picture of views that were sampled one by one; None if it is unknown which of their rows are in use."""
     first, engine = views[0], engine_of(views[0].row)
     # With outlines, all rows pass for used.
-    if any(engine.padded(view.row) and view.outlines is None for view in views):
+    if any(engine.padded(view.row) and view.stencil is None for view in views):
         return None
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
@@ -216,13 +216,13 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         row = laid_out([s.row for s in part_samples], -1, starts[:, index, None])
         samples.append(in_one_table(part_samples).replace(row=row, depth=laid_out([s.depth for s in part_samples], 0)))
     row, depth = laid_out([view.row for view in views], -1, shifts), laid_out([view.depth for view in views], 0)
-    found = [view.outlines for view in views if view.outlines is not None]
+    found = [view.stencil for view in views if view.stencil is not None]
     sampled = replace(
         first,
         samples=tuple(samples),
         cells=Cells(row, depth),
         overflow=sum(view.overflow for view in views),
-        outlines=outlines_side_by_side(found, picture, first_rows, shifts) if found else None,
+        stencil=stencils_side_by_side(found, picture, first_rows, shifts) if found else None,
     )
     return with_counts(sampled, picture, tuple(counts.T))
 

@@ -83,11 +83,11 @@ def _positions_and_colors(
     """
     inputs, engine = of_inputs(context), context.engine
     whole = in_one_table([sampled_picture.samples[index] for sampled_picture in sampled])
-    used, outlines = whole, sampled[0].outlines
-    if outlines is not None and engine.padded(whole.row):
+    used, stencil = whole, sampled[0].stencil
+    if stencil is not None and engine.padded(whole.row):
         before = sum(sampled_picture.ids.shape[-2] for sampled_picture in sampled[0].samples[:index])
         # Engines that pad rows have all views in one picture.
-        used = all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)
+        used = all_in_use(whole, inputs, stencil if len(sampled) == 1 else None, before)
     counts, size = _counts_of(pictures, index), grids[0].size
     shown = Evaluated.of(parts, whole, counts, inputs)
     view, first = [], 0

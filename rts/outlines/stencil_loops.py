@@ -1,0 +1,665 @@
+"""The entries of a stencil, from outlines: areas of the polygons into which they cut pixels, and fluxes. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+
+BORDER = 1e-3
+"""Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
+
+
+@compiled
+def _weigh_breaks(near, slope, rows, inner, pair, stack, cells, shown, movers, moves):
+    """Fill in which samples tell the colours beside breaks, and which their motions.
+
+    Args:
+        near: (B,) of outlines.
+        slope: (B, 2, 2).
+        rows: (B, 2).
+        inner: (B, 2).
+        pair: (B, 2).
+        stack: (B, 2, K); K = 0 for one layer.
+        cells: the number of cells, whose composites come before those of `stack`.
+        shown: (B, 2) int32 to fill: the colours before and behind breaks, or −1.
+        movers: (B, 2) int32 to fill: the samples that breaks move with, or −1: the last ones, or a pair.
+        moves: (B, 2, 3, 2) to fill: motion of breaks along x and y, for motions (x, y, depth) of their two samples.
+    """
+    for b in range(len(near)):
+        paired = pair[b, 0] >= 0
+        for i in range(2):
+            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
+            if stack.shape[2] > 0:
+                shown[b, i] = cells + 2 * b + i if stack[b, i, 0] >= 0 else -1
+            movers[b, i] = pair[b, i] if paired else rows[b, i]
+        moves[b] = 0.0
+        if paired:
+            for i in range(2):
+                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
+            continue
+        if near[b] < 2:
+            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
+            continue
+        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
+        for a in range(2):
+            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
+            for i in range(2):
+                sign = share if i == 0 else -share
+                moves[b, i, 0, a] = -sign * slope[b, i, 0]
+                moves[b, i, 1, a] = -sign * slope[b, i, 1]
+                moves[b, i, 2, a] = sign
+
+
+@compiled(inline="always")
+def _place(x, y, side):
+    """A place on a square's sides, clockwise from the upper left corner, 0 to 4."""
+    if side == 0:
+        return x
+    if side == 1:
+        return 1 + y
+    return 3 - x if side == 2 else 4 - y
+
+
+@compiled(inline="always")
+def _point(place, x, y, along):
+    """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
+    x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
+    return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
+
+
+@compiled(inline="always")
+def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
+    """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
+    for r in range(4):
+        rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
+        flux[s, k, i, r, 0] += rate * dy
+        flux[s, k, i, r, 1] -= rate * dx
+
+
+@compiled(inline="always")
+def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
+    """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
+
+    Returns the place of the break on the sides.
+
+    Args:
+        flux: see `weigh_segments`; filled in for segment s and jump i.
+        weight: (N, 4), to fill row n: by how much the colours of the cells' quarters rise with the jump, clockwise.
+        s: the segment.
+        i: the jump.
+        n: the row of `weight`.
+        side: the side.
+        border: see `weigh_segments`.
+        ray: (3, 2), the break, a point between, and where the outlines meet.
+        rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
+        other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
+    """
+    sign, start = 1.0 if side < 2 else -1.0, _place(ray[0, 0], ray[0, 1], side)
+    for k in range(4):
+        low = 2.5 if k == 0 or k == 3 else 2.0
+        weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
+    for p in range(2):
+        x, y = ray[p, 0], ray[p, 1]
+        wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
+        a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+        b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+        for m in range(3):
+            begin, end = (0.0 if m == 0 else (min(a, b) if m == 1 else max(a, b))), 1.0
+            if m < 2:
+                end = min(a, b) if m == 0 else max(a, b)
+            dx, dy, t = (end - begin) * wx, (end - begin) * wy, (begin + end) / 2
+            if dx == 0 and dy == 0:
+                continue
+            px, py = x + t * wx, y + t * wy
+            right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
+            below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+            for k in range(4):
+                east, south = k == 1 or k == 2, k >= 2
+                height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
+                weight[n, k] += height * dx
+                of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
+                if of_cell != 0:
+                    own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
+                    _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
+                    _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
+    return start
+
+
+@compiled(inline="always")
+def _along(ax, ay, bx, by, x, y):
+    """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
+    dx, dy = bx - ax, by - ay
+    square = dx * dx + dy * dy
+    t = ((x - ax) * dx + (y - ay) * dy) / square if square > 0 else 0.0
+    t = min(max(t, 0.0), 1.0)
+    return t, (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
+
+
+@compiled(inline="always")
+def _fill_path(path, s, place, gap, square, ties, corner):
+    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
+    for e in range(2):
+        b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+        path[2 * e, 0], path[2 * e, 1] = _point(place[b], x, y, gap[b, 2])
+    path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
+
+
+@compiled(inline="always")
+def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
+    """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
+
+    `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
+    """
+    t, own, share = 0.0, 1 + e, 0.0
+    if s != h:
+        x, y = path[1, 0], path[1, 1]
+        first, near = _along(of_hub[0, 0], of_hub[0, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        second, far = _along(of_hub[2, 0], of_hub[2, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        t, own = (first, 0) if near <= far else (second, 3)
+        share, _ = _along(path[0, 0], path[0, 1], path[2, 0], path[2, 1], x, y)
+    for a in range(2):
+        ray[0, a], ray[1, a], ray[2, a] = path[2 * e, a], path[1, a], of_hub[1, a]
+    for r in range(4):
+        rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
+        rates[0, 1, r] = pull[s, r] if s == h else (1 - share if r == 1 else (share if r == 2 else 0.0))
+        rates[1, 0, r] = t * pull[h, r] + (1 - t if r == own else 0.0)
+        rates[1, 1, r] = pull[h, r]
+
+
+@compiled
+def _fill_order(count, sides, at, breaks, order):
+    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start."""
+    for e in range(count):
+        here = e
+        while here > 0:
+            other = order[here - 1]
+            after = at[other] > at[e] if at[other] != at[e] else (breaks[other] > breaks[e]) == (sides[e] < 2)
+            if not (sides[other] > sides[e] or (sides[other] == sides[e] and after)):
+                break
+            order[here] = other
+            here -= 1
+        order[here] = e
+
+
+@compiled
+def _behind(start, end, corner):
+    """The area of a cell's quarter that a straight piece adds to that behind a ray; see `_weigh_ray`."""
+    east, south, total = corner == 1 or corner == 2, corner >= 2, 0.0
+    (x, y), (wx, wy) = start, (end[0] - start[0], end[1] - start[1])
+    a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+    b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+    low, high = min(a, b), max(a, b)
+    for begin, stop in ((0.0, low), (low, high), (high, 1.0)):
+        t = (begin + stop) / 2
+        if (x + t * wx >= 0.5) == east:
+            total += min(max(y + t * wy - (0.5 if south else 0.0), 0.0), 0.5) * (stop - begin) * wx
+    return total
+
+
+@compiled
+def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
+    """Make one hub of those whose rays alternate around a square, since lines to them cross.
+
+    Rays of one go on, straight, to the other.
+
+    Args:
+        first: the first segment of the square.
+        count: number of rays.
+        order: the rays in order, clockwise.
+        hubs: the hub of each ray, counted in the square; changed.
+        corner: (S, 2), where hubs are.
+        weight: (N, 4), see `_add_areas`; changed.
+        last: room for a number a hub.
+        open_hubs: room for a number a hub.
+    """
+    for p in range(count):
+        last[hubs[order[p]]] = p
+    depth = 0
+    for p in range(count):
+        hub, found = hubs[order[p]], -1
+        while depth > 0 and last[open_hubs[depth - 1]] < p:
+            depth -= 1
+        for d in range(depth):
+            if open_hubs[d] == hub:
+                found = d
+        if found < 0:
+            open_hubs[depth], depth = hub, depth + 1
+            continue
+        for d in range(found + 1, depth):
+            other = open_hubs[d]
+            start = corner[first + other, 0], corner[first + other, 1]
+            end = corner[first + hub, 0], corner[first + hub, 1]
+            for e in range(count):
+                if hubs[e] == other:
+                    hubs[e] = hub
+                    for k in range(4):
+                        weight[e, k] += _behind(start, end, k)
+            last[hub] = max(last[hub], last[other])
+        depth = found + 1
+
+
+@compiled
+def _fill_regions(count, order, hubs, region):
+    """Fill `region`: for the piece of a square's sides behind each ray, in order, the number of the region there.
+
+    A region reaches from the piece between two rays to others, if these rays end at one hub and no ray of it lies
+    between.
+
+    Args:
+        count: number of rays.
+        order: the rays in order, clockwise.
+        hubs: the hub of each ray.
+        region: to fill.
+    """
+    for p in range(count):
+        region[p] = p
+    for p in range(count):
+        before = (p - 1) % count
+        while hubs[order[before]] != hubs[order[p]]:
+            before = (before - 1) % count
+        own, other = region[before], region[(p - 1) % count]
+        for q in range(count):
+            if region[q] == other:
+                region[q] = own
+
+
+@compiled
+def _add_areas(count, order, sides, breaks, region, weight, area, pieces, corner, own_color, shown, colors, n):
+    """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
+
+    The cell's own region is the one around its centre, and has the centre's colour, which counts by the whole cell
+    already. The others have the mean of the colours beside them, at the breaks where they begin and end.
+
+    Args:
+        count: number of rays.
+        order: the rays in order, clockwise.
+        sides: the side of the square that each ray starts from.
+        breaks: the break that it starts from.
+        region: see `_fill_regions`.
+        weight: (N, 4), the area of the cell's quarter behind each ray, clockwise, up to a constant.
+        area: room for a number a region.
+        pieces: room for a number a region.
+        corner: the corner of the square, clockwise from the upper left: 0 to 3.
+        own_color: the cell's (flat) number, and the colour of its centre, or −1.
+        shown: (B, 2), see `_weigh_breaks`.
+        colors: cells (E,), colours (E,), weights (E,), and the colours (E,) that these are taken of, or −1: to fill
+            from `n` on.
+        n: number of entries so far.
+    """
+    cell_of, color_of, weight_of, from_of = colors
+    cell, centre = own_color
+    here = -1
+    for p in range(count):
+        area[p], pieces[p] = 0.0, 0
+        here += sides[order[p]] < corner
+    own = region[here % count]
+    for p in range(count):
+        area[region[p]] += weight[order[p], corner] - weight[order[(p + 1) % count], corner]
+        pieces[region[p]] += 1
+    area[own] += 0.25
+    total = 0.0
+    for p in range(count):
+        area[p] = max(area[p], 0.0)
+        total += area[p]
+    # Where lines for outlines cross, what they take twice is shared out.
+    scale = 0.25 / total
+    if centre >= 0 and area[own] * scale != 0.25:
+        cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, centre, -1, area[own] * scale - 0.25
+        n += 1
+    area[own] = 0.0
+    for p in range(count):
+        share = area[region[p]] * scale / (2 * pieces[region[p]])
+        if share == 0:
+            continue
+        first, second = order[p], order[(p + 1) % count]
+        for color in (shown[breaks[first], int(sides[first] < 2)], shown[breaks[second], int(sides[second] >= 2)]):
+            if color >= 0:
+                cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, color, -1, share
+                n += 1
+    return n
+
+
+@compiled
+def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
+    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns the new number of entries."""
+    cell_of, sample_of, weight_of, colors_of = motions
+    for k in range(4):
+        cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
+        for e in range(2):
+            tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+            before, behind = shown[tie, 0], shown[tie, 1]
+            for r in range(4):
+                x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
+                b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
+                if b < 0 or before == behind or (x == 0 and y == 0):
+                    continue
+                for i in range(2):
+                    of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
+                    of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
+                    of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
+                    if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
+                        continue
+                    cell_of[m], sample_of[m] = cell, movers[b, i]
+                    weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
+                    colors_of[m, 0], colors_of[m, 1] = before, behind
+                    m += 1
+    return m
+
+
+@compiled
+def _add_squares(
+    place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves, colors, motions,
+):  # fmt: skip
+    """Add the entries of segments, square after square; see `entries`. Returns the numbers of both kinds.
+
+    From each break on a square's sides a ray goes to a hub inside: the corner of its segment, or of the one that this
+    ends at or crosses. Between the rays lie regions.
+    """
+    width, most, first, n, m = fronts.shape[1], 1, 0, 0, 0
+    while first < len(square):
+        stop = first + 1
+        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
+            stop += 1
+        most, first = max(most, stop - first), stop
+    sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    order, hubs = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    region, pieces = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
+    weight, at, area = np.empty((2 * most, 4)), np.empty(2 * most), np.empty(2 * most)
+    flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
+    ray, rates, of_hub, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
+    first = 0
+    while first < len(square):
+        stop, count = first + 1, 0
+        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
+            stop += 1
+        flux[: stop - first] = 0.0
+        for s in range(first, stop):
+            members[s - first] = 0
+        for s in range(first, stop):
+            members[s + hub[s] - first] += ties[s, 0] != ties[s, 1]
+        for s in range(first, stop):
+            if ties[s, 0] == ties[s, 1]:
+                continue
+            leader = s + hub[s]
+            both = members[leader - first] == 1 and ties[s, 1] >= 0
+            _fill_path(of_hub, leader, place, gap, square, ties, corner)
+            _fill_path(path, s, place, gap, square, ties, corner)
+            for e in range(2 if ties[s, 1] >= 0 else 1):
+                side, other = square_sides[s, e], 0.0
+                if both:
+                    other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
+                _fill_ray(leader, s, e, of_hub, path, pull, ray, rates)
+                at[count] = _weigh_ray(flux, weight, s - first, e, count, side, BORDER, ray, rates, other)
+                sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
+                count += 1
+        if count > 0:
+            _fill_order(count, sides, at, breaks, order)
+            _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
+            _fill_regions(count, order, hubs, region)
+            for k in range(4):
+                y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
+                own = y * width + x, fronts[y, x]
+                n = _add_areas(count, order, sides, breaks, region, weight, area, pieces, k, own, shown, colors, n)
+        for s in range(first, stop):
+            if ties[s, 0] != ties[s, 1]:
+                m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
+        first = stop
+    return n, m
+
+
+@compiled(inline="always")
+def _fill_normals(gap, place, ties, normal):
+    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    for b in range(len(gap)):
+        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
+    for s in range(len(ties)):
+        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
+            continue
+        start, end = ties[s, 0], ties[s, 1]
+        nx = gap[end, 0] - gap[start, 0] + place[end] * (1 - gap[end, 2]) - place[start] * (1 - gap[start, 2])
+        ny = gap[start, 1] - gap[end, 1] + place[start] * gap[start, 2] - place[end] * gap[end, 2]
+        for b in (start, end):
+            # Two segments at a line of crossing may run in opposite directions.
+            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
+            normal[b, 0] += sign * nx
+            normal[b, 1] += sign * ny
+    for b in range(len(gap)):
+        length = np.hypot(normal[b, 0], normal[b, 1])
+        normal[b, 0] /= length
+        normal[b, 1] /= length
+
+
+@compiled
+def _former(gap, b, i, joined):
+    """The cell (y, x) before the one on a side of a break, or the latter if it shows another surface; True if not."""
+    right, down = gap[b, 2], 1 - gap[b, 2]
+    y, x = gap[b, 0] + i * down, gap[b, 1] + i * right
+    step = 1 if i == 1 else -1
+    by, bx = y + step * down, x + step * right
+    inside = 0 <= by < joined.shape[1] and 0 <= bx < joined.shape[2]
+    on = inside and joined[down, min(y, by), min(x, bx)]
+    return (by, bx, True) if on else (y, x, False)
+
+
+@compiled
+def _add_sides(
+    place, gap, ends, rows, stack, ties, joined, row, fronts, shown, stacks, colors, motions, n, m, r
+):  # fmt: skip
+    """Add the entries of the surfaces on both sides of breaks; see `entries`. Returns the numbers of all kinds.
+
+    From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
+    change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
+    the outline's normal, with the mean motion of both samples. What is left of a cell that the outline cuts has a mean
+    colour other than C: the slope from the centre before tells it. The strip in the next cell differs from X by half
+    the slope times its width.
+
+    Of layers each moves by itself: what ends at the break along the normal, others along the gap.
+    """
+    normal, width = np.empty((len(gap), 2)), fronts.shape[1]
+    _fill_normals(gap, place, ties, normal)
+    cell_of, color_of, weight_of, from_of = colors
+    for b in range(len(gap)):
+        nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
+        ahead, step = nx * right + ny * (1 - right), right + (1 - right) * width
+        for i in range(2):
+            last, way = shown[b, i], 1 - 2 * i
+            if not (ends[b, i] and last >= 0):
+                continue
+            y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
+            cell, here = y * width + x, fronts[y, x]
+            next_ = cell + way * step
+            length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
+            inside, outside = min(length, 0.5), max(length - 0.5, 0.0)
+            by, bx, on = _former(gap, b, i, joined)
+            former, rate = fronts[by, bx], 1 / (1 + length) if on else 1 / max(length, 0.5)
+            if here < 0:
+                continue
+            nearer = ahead * ahead * (0.125 - inside**2 / 2) if on else 0.0
+            farther = ahead * ahead * rate * outside**2 / 2
+            for at, color, share in ((cell, here, nearer), (next_, last, farther)):
+                if share > 0 and former >= 0 and color != former:
+                    cell_of[n], color_of[n], from_of[n], weight_of[n] = at, former, color, share
+                    n += 1
+            mine = inside / (length if length > 1e-6 else 1.0)
+            across = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
+            if stack.shape[2] == 0:
+                for at, share in ((cell, mine), (next_, 1 - mine)):
+                    m = _add_motion(motions, m, at, rows[b, i], share, across, last, here)
+                    m = _add_motion(motions, m, at, row[0, y, x], share, across, last, here)
+                continue
+            along = -0.5 * way * right, -0.5 * way * (1 - right)
+            for k in range(stack.shape[2]):
+                own, there, stays = row[k, y, x], stack[b, i, k], False
+                if own == there:
+                    continue
+                for other in range(stack.shape[2]):
+                    stays |= stack[b, 1 - i, other] == there
+                for other in range(stack.shape[2]):
+                    stacks[r, other] = row[other, y, x] if other != k else there
+                for at, share in ((cell, mine), (next_, 1 - mine)):
+                    for sample in (own, there):
+                        moves = along if stays else across
+                        m = _add_motion(motions, m, at, sample, share, moves, joined.shape[1] * width + r, here)
+                r += 1
+    return n, m, r
+
+
+@compiled(inline="always")
+def _add_motion(motions, m, cell, sample, share, moves, color, other):
+    """Add an entry of motions along x and y, unless it is 0. Returns the new number of entries."""
+    x, y = share * moves[0], share * moves[1]
+    if sample >= 0 and color != other and (x != 0 or y != 0):
+        motions[0][m], motions[1][m] = cell, sample
+        motions[2][m, 0], motions[2][m, 1], motions[2][m, 2] = x, y, 0.0
+        motions[3][m, 0], motions[3][m, 1] = color, other
+        m += 1
+    return m
+
+
+@compiled
+def _by_cells(cell, count, cells):
+    """The entries of each cell: `first` (cells + 1,), and `order` (count,), in which they lie."""
+    first, order = np.zeros(cells + 1, np.int64), np.empty(count, np.int64)
+    for n in range(count):
+        first[cell[n] + 1] += 1
+    for c in range(cells):
+        first[c + 1] += first[c]
+    for n in range(count):
+        order[first[cell[n]]] = n
+        first[cell[n]] += 1
+    for c in range(cells, 0, -1):
+        first[c] = first[c - 1]
+    first[0] = 0
+    return first, order
+
+
+@compiled(inline="always")
+def _at(colors, several, color):
+    """The place of a colour among the first `several`, or `several`."""
+    at = 0
+    while at < several and colors[at] != color:
+        at += 1
+    return at
+
+
+@compiled
+def _sorted_colors(colors, count, fronts, real):
+    """Entries of colours by cell, one for each colour of a cell, without those of 0, in the dtype of `real`.
+
+    In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts: regions
+    fill the cell, and of a colour no more is taken than there is.
+    """
+    raw_cell, raw_color, raw_weight, raw_from = colors
+    first, order = _by_cells(raw_cell, count, fronts.size)
+    cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, real.dtype)
+    most = 0
+    for c in range(fronts.size):
+        most = max(most, first[c + 1] - first[c])
+    color, weight, n = np.empty(most + 1, np.int32), np.empty(most + 1), 0
+    for c in range(fronts.size):
+        if first[c + 1] == first[c]:
+            continue
+        own, several = fronts[c // fronts.shape[1], c % fronts.shape[1]], 1
+        color[0], weight[0] = own, 1.0 if own >= 0 else 0.0
+        for e in range(first[c], first[c + 1]):  # In the order of entries: areas before what is taken of them.
+            entry, taken = order[e], raw_weight[order[e]]
+            if raw_from[entry] >= 0:
+                at = _at(color, several, raw_from[entry])
+                taken = min(taken, max(weight[at], 0.0)) if at < several else 0.0
+                weight[min(at, several - 1)] -= taken
+            at = _at(color, several, raw_color[entry])
+            if at == several:
+                color[at], weight[at], several = raw_color[entry], 0.0, several + 1
+            weight[at] += taken
+        for e in range(several):
+            share = max(weight[e], 0.0) - (1 if e == 0 and own >= 0 else 0)
+            if share != 0 and color[e] >= 0:
+                cell_of[n], color_of[n], weight_of[n] = c, color[e], share
+                n += 1
+    return cell_of[:n], color_of[:n], weight_of[:n]
+
+
+@compiled
+def _sorted_motions(motions, count, cells, real):
+    """Entries of motions by cell, in the dtype of `real`; those of one sample and the same colours are one."""
+    raw_cell, raw_sample, raw_weight, raw_colors = motions
+    first, order = _by_cells(raw_cell, count, cells)
+    cell_of, sample_of = np.empty(count, np.int32), np.empty(count, np.int32)
+    weight_of, colors_of, m = np.zeros((count, 3), real.dtype), np.empty((count, 2), np.int32), 0
+    for c in range(cells):
+        start = m
+        for e in range(first[c], first[c + 1]):
+            entry, at = order[e], start
+            sample, before, behind = raw_sample[entry], raw_colors[entry, 0], raw_colors[entry, 1]
+            while at < m and not (
+                sample_of[at] == sample and colors_of[at, 0] == before and colors_of[at, 1] == behind
+            ):
+                at += 1
+            if at == m:
+                cell_of[m], sample_of[m], m = c, sample, m + 1
+                colors_of[at, 0], colors_of[at, 1] = before, behind
+            for a in range(3):
+                weight_of[at, a] += raw_weight[entry, a]
+    return cell_of[:m], sample_of[:m], weight_of[:m], colors_of[:m]
+
+
+@loop
+def entries(
+    place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
+    joined, row, real,
+):  # fmt: skip
+    """The entries of a stencil; see `rts.contracts.records.Stencil`.
+
+    Args:
+        place: (B,) of outlines, as all up to `joined`.
+        gap: (B, 3).
+        near: (B,).
+        slope: (B, 2, 2).
+        ends: (B, 2).
+        rows: (B, 2).
+        inner: (B, 2).
+        pair: (B, 2).
+        stack: (B, 2, K); K = 0 for one layer.
+        square: (S, 2).
+        ties: (S, 2).
+        square_sides: (S, 2).
+        hub: (S,).
+        beyond: (S, 2).
+        corner: (S, 2).
+        pull: (S, 4).
+        joined: (2, H, W).
+        row: (K, H, W) int32, the samples in cells.
+        real: (0,), of the dtype of weights.
+
+    Returns:
+        Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
+    """
+    count, segments, layers, (height, width) = len(place), len(square), stack.shape[2], joined.shape[1:]
+    cells = height * width
+    shown, movers = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32)
+    moves = np.empty((count, 2, 3, 2))
+    _weigh_breaks(near, slope, rows, inner, pair, stack, cells, shown, movers, moves)
+    fronts = row[0].copy()
+    if layers > 0:
+        for y in range(height):
+            for x in range(width):
+                fronts[y, x] = y * width + x if row[0, y, x] >= 0 else -1
+    stacks = np.empty((2 * count * (1 + layers) if layers > 0 else 0, layers), np.int32)
+    for b in range(count if layers > 0 else 0):
+        stacks[2 * b], stacks[2 * b + 1] = stack[b, 0], stack[b, 1]
+    most = 20 * segments + 8 * count
+    colors = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most, np.int32)
+    most = 64 * segments + 8 * count * max(layers, 1)
+    motions = np.empty(most, np.int32), np.empty(most, np.int32), np.empty((most, 3)), np.empty((most, 2), np.int32)
+    n, m = _add_squares(
+        place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves, colors, motions
+    )
+    r = 2 * count if layers > 0 else 0
+    n, m, r = _add_sides(
+        place, gap, ends, rows, stack, ties, joined, row, fronts, shown, stacks, colors, motions, n, m, r
+    )
+    of_colors, of_motions = _sorted_colors(colors, n, fronts, real), _sorted_motions(motions, m, cells, real)
+    return of_colors, of_motions, stacks[:r]

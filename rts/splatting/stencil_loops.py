@@ -1,0 +1,227 @@
+"""A stencil times colours, and its derivatives. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+
+
+@compiled
+def _used(weight):
+    """The number of entries up to the last one that has an effect; `weight` is (E,) or (E, 3)."""
+    flat = weight.reshape(-1)
+    used, each = flat.size, flat.size // max(len(weight), 1)
+    while used > 0 and flat[used - 1] == 0:
+        used -= 1
+    return (used + each - 1) // max(each, 1)
+
+
+@compiled
+def _first(cell, used, least):
+    """The first of the `used` entries whose cell is at least `least`."""
+    low, high = 0, used
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if cell[middle] < least else (low, middle)
+    return low
+
+
+@compiled(inline="always")
+def _line(cell, line, width, border):
+    """The line of the image that a cell lies in, which is `line` or a later one."""
+    while cell >= (line + border + 1) * width:
+        line += 1
+    return line
+
+
+@compiled(inline="always")
+def _of(colors, n, c):
+    """A channel of a colour; 0 for none."""
+    return colors[np.uint32(n), c] if n >= 0 else 0.0
+
+
+@compiled(inline="always")
+def _beside(front, joined, y, x):
+    """The colours of the next cells to the left and right, above and below.
+
+    Where the next cell shows another surface, the cell's own colour stands in.
+    """
+    n = front[y, x]
+    left = front[y, x - 1] if x > 0 and joined[0, y, x - 1] else n
+    right = front[y, x + 1] if joined[0, y, x] else n
+    above = front[y - 1, x] if y > 0 and joined[1, y - 1, x] else n
+    below = front[y + 1, x] if joined[1, y, x] else n
+    return left, right, above, below
+
+
+@loop
+def value(first, last, border, colors, front, color_cell, color_sample, color_weight, out):
+    """Fill lines `first` to `last` of `out` (h, w, C); other arguments as of `rts.splatting.stencil.splat`."""
+    width, used = front.shape[1], _used(color_weight)
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            n = front[np.uint32(i + border), np.uint32(j + border)]  # Compiled code need not check for negative ones.
+            for c in range(out.shape[2]):
+                out[i, j, c] = _of(colors, n, c)
+    line = first
+    for e in range(_first(color_cell, used, (first + border) * width), used):
+        line = _line(color_cell[e], line, width, border)
+        j = color_cell[e] - (line + border) * width - border
+        if line >= last:
+            break
+        if 0 <= j < out.shape[1]:
+            for c in range(out.shape[2]):
+                out[line, j, c] += color_weight[e] * _of(colors, color_sample[e], c)
+
+
+@loop
+def push(
+    first, last, border, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample,
+    motion_weight, motion_colors, t_positions, t_colors, out,
+):  # fmt: skip
+    """Fill lines of `out` (h, w, C) with the derivative of `value` along tangents; empty ones are zeros."""
+    width = front.shape[1]
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            y, x = np.uint32(i + border), np.uint32(j + border)
+            n = front[y, x]
+            for c in range(out.shape[2]):
+                out[i, j, c] = _of(t_colors, n, c) if len(t_colors) else 0.0
+            if n < 0 or not len(t_positions):
+                continue
+            left, right, above, below = _beside(front, joined, y, x)
+            if left == right and above == below:
+                continue
+            mx, my = t_positions[n, 0] / 2, t_positions[n, 1] / 2
+            for c in range(out.shape[2]):
+                aside, down = colors[right, c] - colors[left, c], colors[below, c] - colors[above, c]
+                out[i, j, c] -= aside * mx + down * my
+    used, line = _used(color_weight) if len(t_colors) else 0, first
+    for e in range(_first(color_cell, used, (first + border) * width), used):
+        line = _line(color_cell[e], line, width, border)
+        j = color_cell[e] - (line + border) * width - border
+        if line >= last:
+            break
+        if 0 <= j < out.shape[1]:
+            for c in range(out.shape[2]):
+                out[line, j, c] += color_weight[e] * _of(t_colors, color_sample[e], c)
+    used, line = _used(motion_weight) if len(t_positions) else 0, first
+    for e in range(_first(motion_cell, used, (first + border) * width), used):
+        line = _line(motion_cell[e], line, width, border)
+        j = motion_cell[e] - (line + border) * width - border
+        if line >= last:
+            break
+        if 0 <= j < out.shape[1]:
+            rate = _rate(motion_weight, e, t_positions, motion_sample[e])
+            for c in range(out.shape[2]):
+                jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
+                out[line, j, c] += rate * jump
+
+
+@compiled(inline="always")
+def _rate(motion_weight, e, t_positions, n):
+    """What an entry of motions weighs, along a tangent of positions (N, 3)."""
+    x, y, z = t_positions[n, 0], t_positions[n, 1], t_positions[n, 2]
+    return motion_weight[e, 0] * x + motion_weight[e, 1] * y + motion_weight[e, 2] * z
+
+
+@loop
+def pull(
+    border, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight,
+    motion_colors, g, g_positions, g_colors,
+):  # fmt: skip
+    """Add to gradients of positions and colours those of `g` (h, w, C); empty ones are not wanted."""
+    width = front.shape[1]
+    for i in range(g.shape[0]):
+        for j in range(g.shape[1]):
+            y, x = np.uint32(i + border), np.uint32(j + border)
+            n = front[y, x]
+            if n < 0:
+                continue
+            if len(g_colors):
+                for c in range(g.shape[2]):
+                    g_colors[n, c] += g[i, j, c]
+            if not len(g_positions):
+                continue
+            left, right, above, below = _beside(front, joined, y, x)
+            if left != right or above != below:
+                for c in range(g.shape[2]):
+                    g_positions[n, 0] -= (colors[right, c] - colors[left, c]) / 2 * g[i, j, c]
+                    g_positions[n, 1] -= (colors[below, c] - colors[above, c]) / 2 * g[i, j, c]
+    used, line = _used(color_weight) if len(g_colors) else 0, 0
+    for e in range(_first(color_cell, used, border * width), used):
+        line = _line(color_cell[e], line, width, border)
+        j, n = color_cell[e] - (line + border) * width - border, color_sample[e]
+        if line >= g.shape[0]:
+            break
+        if 0 <= j < g.shape[1] and n >= 0:
+            for c in range(g.shape[2]):
+                g_colors[n, c] += color_weight[e] * g[line, j, c]
+    used, line = _used(motion_weight) if len(g_positions) else 0, 0
+    for e in range(_first(motion_cell, used, border * width), used):
+        line = _line(motion_cell[e], line, width, border)
+        j, n = motion_cell[e] - (line + border) * width - border, motion_sample[e]
+        if line >= g.shape[0]:
+            break
+        if 0 <= j < g.shape[1]:
+            total = 0.0
+            for c in range(g.shape[2]):
+                jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
+                total += jump * g[line, j, c]
+            for a in range(3):
+                g_positions[n, a] += motion_weight[e, a] * total
+
+
+@loop
+def columns(
+    cells, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight,
+    motion_colors, t_positions, t_colors, out,
+):  # fmt: skip
+    """Fill `out` (T, n, C) with the derivatives of some cells along T directions.
+
+    Args:
+        cells: (n,) int64, y · W + x.
+        colors: as all up to `motion_colors`, see `value`.
+        front: see there.
+        joined: see there.
+        color_cell: see there.
+        color_sample: see there.
+        color_weight: see there.
+        motion_cell: see there.
+        motion_sample: see there.
+        motion_weight: see there.
+        motion_colors: see there.
+        t_positions: (T, N, 3) tangents of positions.
+        t_colors: (T, N, C), or (0, 0, C) for zeros.
+        out: to fill.
+    """
+    width, directions, channels = front.shape[1], len(t_positions), colors.shape[1]
+    used_colors, used_motions = _used(color_weight) if len(t_colors) else 0, _used(motion_weight)
+    for i in range(len(cells)):
+        cell = cells[i]
+        y, x = cell // width, cell % width
+        n = front[y, x]
+        for t in range(directions):
+            for c in range(channels):
+                out[t, i, c] = t_colors[t, n, c] if len(t_colors) and n >= 0 else 0.0
+        if n >= 0:
+            left, right, above, below = _beside(front, joined, y, x)
+            for c in range(channels if left != right or above != below else 0):
+                aside, down = (colors[right, c] - colors[left, c]) / 2, (colors[below, c] - colors[above, c]) / 2
+                for t in range(directions):
+                    out[t, i, c] -= aside * t_positions[t, n, 0] + down * t_positions[t, n, 1]
+        e = _first(color_cell, used_colors, cell)
+        while e < used_colors and color_cell[e] == cell:
+            for t in range(directions):
+                for c in range(channels):
+                    out[t, i, c] += color_weight[e] * _of(t_colors[t], color_sample[e], c)
+            e += 1
+        e = _first(motion_cell, used_motions, cell)
+        while e < used_motions and motion_cell[e] == cell:
+            for t in range(directions):
+                rate = _rate(motion_weight, e, t_positions[t], motion_sample[e])
+                for c in range(channels):
+                    jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
+                    out[t, i, c] += rate * jump
+            e += 1
