@@ -78,14 +78,16 @@ def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
 
 
 @compiled(inline="always")
-def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
+def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
     """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
 
     Returns the place of the break on the sides.
 
     Args:
         flux: see `weigh_segments`; filled in for segment s and jump i.
-        weight: (N, 4), to fill row n: by how much the colours of the cells' quarters rise with the jump, clockwise.
+        weight: (N, 4), to fill row n: the areas of the cells' quarters that lie behind the ray, clockwise, but for a
+            constant.
+        length: (N, 4), to fill row n: the lengths of the ray in the quarters.
         s: the segment.
         i: the jump.
         n: the row of `weight`.
@@ -99,6 +101,7 @@ def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
     for k in range(4):
         low = 2.5 if k == 0 or k == 3 else 2.0
         weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
+        length[n, k] = 0.0
     for p in range(2):
         x, y = ray[p, 0], ray[p, 1]
         wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
@@ -118,6 +121,7 @@ def _weigh_ray(flux, weight, s, i, n, side, border, ray, rates, other):
                 east, south = k == 1 or k == 2, k >= 2
                 height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
                 weight[n, k] += height * dx
+                length[n, k] += np.hypot(dx, dy) if (px >= 0.5) == east and (py >= 0.5) == south else 0.0
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
                     own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
@@ -266,21 +270,26 @@ def _fill_regions(count, order, hubs, region):
 
 
 @compiled
-def _add_areas(count, order, sides, breaks, region, weight, area, pieces, corner, own_color, shown, colors, n):
+def _add_areas(
+    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, own_color, shown, colors, n
+):  # fmt: skip
     """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
 
     The cell's own region is the one around its centre, and has the centre's colour, which counts by the whole cell
-    already. The others have the mean of the colours beside them, at the breaks where they begin and end.
+    already. The others have a mean of the colours beside them, at the breaks where they begin and end; of several
+    outlines around a region each counts by its length in the quarter.
 
     Args:
         count: number of rays.
         order: the rays in order, clockwise.
         sides: the side of the square that each ray starts from.
         breaks: the break that it starts from.
+        hubs: the hub of each ray.
         region: see `_fill_regions`.
         weight: (N, 4), the area of the cell's quarter behind each ray, clockwise, up to a constant.
+        length: (N, 4), the lengths of rays in the cells' quarters.
         area: room for a number a region.
-        pieces: room for a number a region.
+        of_hub: room for two numbers a hub.
         corner: the corner of the square, clockwise from the upper left: 0 to 3.
         own_color: the cell's (flat) number, and the colour of its centre, or −1.
         shown: (B, 2), see `_weigh_breaks`.
@@ -292,12 +301,11 @@ def _add_areas(count, order, sides, breaks, region, weight, area, pieces, corner
     cell, centre = own_color
     here = -1
     for p in range(count):
-        area[p], pieces[p] = 0.0, 0
+        area[p] = 0.0
         here += sides[order[p]] < corner
     own = region[here % count]
     for p in range(count):
         area[region[p]] += weight[order[p], corner] - weight[order[(p + 1) % count], corner]
-        pieces[region[p]] += 1
     area[own] += 0.25
     total = 0.0
     for p in range(count):
@@ -308,13 +316,24 @@ def _add_areas(count, order, sides, breaks, region, weight, area, pieces, corner
     if centre >= 0 and area[own] * scale != 0.25:
         cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, centre, -1, area[own] * scale - 0.25
         n += 1
-    area[own] = 0.0
-    for p in range(count):
-        share = area[region[p]] * scale / (2 * pieces[region[p]])
-        if share == 0:
+    for r in range(count):
+        if r == own or area[r] == 0:
             continue
-        first, second = order[p], order[(p + 1) % count]
-        for color in (shown[breaks[first], int(sides[first] < 2)], shown[breaks[second], int(sides[second] >= 2)]):
+        for p in range(2 * count):
+            of_hub[hubs[order[p // 2]]] = 0.0
+        total = 0.0
+        for p in range(2 * count):
+            ray = order[(p + 1) // 2 % count]  # Of each piece of the sides the rays at both ends.
+            if region[p // 2] == r:
+                of_hub[hubs[ray], 0] += length[ray, corner] + 1e-9
+                of_hub[hubs[ray], 1] += 1
+                total += length[ray, corner] + 1e-9
+        for p in range(2 * count):
+            ray = order[(p + 1) // 2 % count]
+            if region[p // 2] != r:
+                continue
+            share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
+            color = shown[breaks[ray], int((sides[ray] < 2) == (p % 2 == 0))]
             if color >= 0:
                 cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, color, -1, share
                 n += 1
@@ -365,11 +384,12 @@ def _add_squares(
         most, first = max(most, stop - first), stop
     sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
     order, hubs = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
-    region, pieces = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    region = np.empty(2 * most, np.int64)
     last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
-    weight, at, area = np.empty((2 * most, 4)), np.empty(2 * most), np.empty(2 * most)
+    weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
+    at, area = np.empty(2 * most), np.empty(2 * most)
     flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
-    ray, rates, of_hub, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
+    ray, rates, leading, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
     first = 0
     while first < len(square):
         stop, count = first + 1, 0
@@ -385,14 +405,16 @@ def _add_squares(
                 continue
             leader = s + hub[s]
             both = members[leader - first] == 1 and ties[s, 1] >= 0
-            _fill_path(of_hub, leader, place, gap, square, ties, corner)
+            _fill_path(leading, leader, place, gap, square, ties, corner)
             _fill_path(path, s, place, gap, square, ties, corner)
             for e in range(2 if ties[s, 1] >= 0 else 1):
                 side, other = square_sides[s, e], 0.0
                 if both:
                     other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
-                _fill_ray(leader, s, e, of_hub, path, pull, ray, rates)
-                at[count] = _weigh_ray(flux, weight, s - first, e, count, side, BORDER, ray, rates, other)
+                _fill_ray(leader, s, e, leading, path, pull, ray, rates)
+                at[count] = _weigh_ray(
+                    flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other
+                )
                 sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
                 count += 1
         if count > 0:
@@ -402,7 +424,9 @@ def _add_squares(
             for k in range(4):
                 y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
                 own = y * width + x, fronts[y, x]
-                n = _add_areas(count, order, sides, breaks, region, weight, area, pieces, k, own, shown, colors, n)
+                n = _add_areas(
+                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, own, shown, colors, n
+                )  # fmt: skip
         for s in range(first, stop):
             if ties[s, 0] != ties[s, 1]:
                 m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
