@@ -41,9 +41,8 @@ Some = Sequence[np.ndarray | None]
 class Operation:
     """A function of arrays that torch and jax can differentiate, in forward and reverse mode, and to second order.
 
-    `forward`, `push` and `pull` compute value and first derivatives if arrays are on the host, or cross to it (see
-    `crosses`), and all floats have one dtype, float32 or float64. Otherwise, and for second derivatives,
-    `specification` runs. Under `vmap` they are called for each item, by several threads perhaps. An operation is called
+    `forward`, `push` and `pull` compute value and first derivatives if arrays are on the host, and all floats have one
+    dtype, float32 or float64. Otherwise, and for second derivatives, `specification` runs, on any device. Under `vmap` they are called for each item, by several threads perhaps. An operation is called
     with its operands, and with parameters by name. Parameters are hashable values, not arrays, and are passed to all of
     its functions but `used`. Their names are not `kept`, `wanted` or `single`, which engines pass themselves.
 
@@ -71,8 +70,6 @@ class Operation:
             then take a keyword `kept`: that object, or None if it is lost.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). Otherwise it is called
             for each direction.
-        crosses: whether operands on another device cross to the host, and the result back, where an engine runs array
-            code there operator by operator, as torch does. This is faster for array code of very many small operators.
     """
 
     name: str
@@ -88,7 +85,6 @@ class Operation:
     used: Callable[[Arrays], int] | None = None
     keeps: bool = False
     sweeps: bool = False
-    crosses: bool = False
 
     @classmethod
     def of_loops(
@@ -148,7 +144,7 @@ class Operation:
                 raise InputError(f"{name} of the operation {self.name} is {quoted(function)}; expected a function")
         for name in ("ranks", "packed"):
             object.__setattr__(self, name, self._integers(name))
-        for name in ("packed_result", "keeps", "sweeps", "crosses"):
+        for name in ("packed_result", "keeps", "sweeps"):
             if type(getattr(self, name)) is not bool:
                 value = quoted(getattr(self, name))
                 raise InputError(f"{name} of the operation {self.name} is {value}; expected True or False")

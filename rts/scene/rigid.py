@@ -101,4 +101,4 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
             result[...] = part
 
 
-RIGID = Operation("rts.rigid", _specification, (1, 1), _shape, _forward, _push, _pull, differentiable=2, crosses=True)
+RIGID = Operation("rts.rigid", _specification, (1, 1), _shape, _forward, _push, _pull, differentiable=2)

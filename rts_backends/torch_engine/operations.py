@@ -18,7 +18,6 @@ from torch import Tensor
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
 from rts_backends.torch_engine.functions import along, foreign, on_host, transformed
-from rts_backends.torch_engine.host_call import to_tensor
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -30,7 +29,7 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
     The array code also runs under `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operation, operands) or _specifying.on or torch.compiler.is_compiling():
+    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
     return _Value.apply(_Call(operation, params), *[x.contiguous() for x in operands])
@@ -48,16 +47,16 @@ class _Specifying(threading.local):
 _specifying = _Specifying()
 
 
-def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
+def _fits(operands: Sequence[Tensor]) -> bool:
     """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
 
-    They are on the host, or cross to it from one device; those of the device "meta" have no values.
+    All are on the host.
     """
-    real, device = operands[0].dtype, operands[0].device
-    if real not in _DTYPES or not (device.type == "cpu" or (operation.crosses and device.type != "meta")):
+    real = operands[0].dtype
+    if real not in _DTYPES:
         return False
     for x in operands:
-        if x.device != device or (x.dtype != real and x.dtype not in _INTEGERS):
+        if not x.is_cpu or (x.dtype != real and x.dtype not in _INTEGERS):
             return False
     return True
 
@@ -65,29 +64,19 @@ def _fits(operation: Operation, operands: Sequence[Tensor]) -> bool:
 class _Call:
     """A call of an operation, and the arrays that its value keeps for the derivatives.
 
-    The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`; their copies on the host, of
-    an operation that crosses, are kept as long. Under `vmap` each item has a
+    The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has a
     call of its own.
     """
 
-    __slots__ = ("_crossed", "count", "kept", "operation", "params")
+    __slots__ = ("count", "kept", "operation", "params")
 
     def __init__(self, operation: Operation, params: Mapping[str, Any]):
         self.operation, self.params = operation, params
         self.count, self.kept = operation.differentiable, None
-        self._crossed: list[np.ndarray] | None = None
 
     def another(self) -> _Call:
         """A call of this operation with these parameters, at other operands."""
         return _Call(self.operation, self.params)
-
-    def on_host(self, operands: Sequence[Tensor]) -> list[np.ndarray]:
-        """The operands on the host, always the same; they cross from a device once."""
-        if operands[0].is_cpu:
-            return _host(operands)
-        if self._crossed is None:
-            self._crossed = _host(operands)
-        return self._crossed
 
     def split(self, operands: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
         """The differentiable operands at the head of `operands`, and the rest."""
@@ -159,8 +148,8 @@ class _Value(torch.autograd.Function):
 
     @staticmethod
     def forward(call, *operands):
-        out, call.kept = call.operation.value_on_host(call.on_host(operands), call.params)
-        return to_tensor(out, operands[0].device)
+        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
+        return torch.from_numpy(out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -207,11 +196,11 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(call, wanted, *arrays):
-        operands, (g,) = call.on_host(arrays[:-1]), _host(arrays[-1:])
+        operands, (g,) = _host(arrays[:-1]), _host(arrays[-1:])
         found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
         results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
-        return tuple(to_tensor(x, arrays[0].device) for x in found)
+        return tuple(torch.from_numpy(x) for x in found)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -253,11 +242,11 @@ class _Push(torch.autograd.Function):
     @staticmethod
     def forward(call, present, *arrays):
         count = sum(present)
-        operands, tangents = call.on_host(arrays[:-count]), _host(arrays[-count:])
+        operands, tangents = _host(arrays[:-count]), _host(arrays[-count:])
         shape = call.operation.result_shape(*(x.shape for x in operands), **call.params)
         out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
         call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)
-        return to_tensor(out, arrays[0].device)
+        return torch.from_numpy(out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
