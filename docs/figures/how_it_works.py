@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import matplotlib
 import numpy as np
@@ -17,6 +18,8 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.path import Path as Outline
+from rts.outlines import reference
+from rts.outlines.found import Outlines
 
 IMAGES = Path(__file__).parents[1] / "images/how-it-works"
 INK, PALE, GRID = "#1f2937", "#6b7280", "#d1d5db"
@@ -102,6 +105,21 @@ def cards() -> tuple[list[Any], Any]:
     return [near, far], rts.Camera.look_at((0, 0, EYE), (0, 0, 0), fov_y=float(VIEW))
 
 
+def sampled_cards() -> tuple[Any, Any, np.ndarray]:
+    """Samples of the cards; the outlines that their stencil is made of, which nothing hands on; and samples of cells."""
+    found, whole = [], Outlines.stencil
+
+    def stencil(self: Any, starts: np.ndarray, row: np.ndarray, *told: Any) -> Any:
+        rows = np.where(self.rows >= 0, self.rows + starts[self.parts], -1)
+        found.append((self._replace(rows=rows), row))
+        return whole(self, starts, row, *told)
+
+    parts, camera = cards()
+    with mock.patch.object(Outlines, "stencil", stencil):
+        sampled = rts.sample(parts, camera, (SIDE, SIDE), splatter="edges")
+    return sampled, *found[0]
+
+
 def chosen_break(found: Any, apron: int, y: int, x: int) -> int:
     """The index of the break in the gap along the row from pixel (y, x)."""
     [(index,)] = np.argwhere((found.gap == (y + apron, x + apron, 1)).all(axis=1))
@@ -179,9 +197,8 @@ def gap() -> Figure:
     """A gap, its samples, and the area: outlines between centres, as the library finds them."""
     made, (eye, above, area) = figure(10, 3.5, 3)
     parts, camera = cards()
-    sampled = rts.sample(parts, camera, (SIDE, SIDE), splatter="edges")
-    found, apron = sampled.outlines, sampled.apron
-    y, x = 4, 3
+    sampled, found, _ = sampled_cards()
+    apron, (y, x) = sampled.apron, (4, 3)
     index = chosen_break(found, apron, y, x)
     seen_from_the_eye(eye, found, apron)
     eye.add_patch(Rectangle((x + 0.3, y + 0.3), 1.4, 0.4, fc="none", ec=PINK, lw=1.3))
@@ -190,6 +207,57 @@ def gap() -> Figure:
     image = rts.render(parts, camera, (SIDE, SIDE), splatter="edges")
     eye.add_patch(Rectangle((x, y), 1, 1, fc="none", ec=GREEN, lw=1.3))
     share_of_a_pixel(area, y, x, float(image[y, x, 0]))
+    return made
+
+
+# --------------------------------------------------------------------------------------------------------- a matrix
+
+
+def inside_cell(polygon: list, corner: int, right: int, down: int) -> np.ndarray:
+    """A polygon of a square, cut off at the quarter at a corner, from the upper left of that cell."""
+    low = reference.CORNERS[corner] / 2
+    return np.clip(np.array(polygon), low, low + 0.5) + np.array([0.5 - right, 0.5 - down])
+
+
+def matrix() -> Figure:
+    """A pixel at the corner of the near card: its regions, and its row of the matrix."""
+    made, (pixel, table) = figure(8.4, 3.4, 2)
+    sampled, found, row = sampled_cards()
+    stencil, owners = sampled.stencil, np.repeat((0, 1), [len(one.ids) for one in sampled.samples])
+    corner = CARD[np.argmin(CARD[:, 0] + CARD[:, 1]), :2] * (1, -1) + SIDE / 2
+    cell = tuple((np.floor(corner).astype(int) + sampled.apron)[::-1])
+    shades = ("#F2BE99", "#99C7E0")
+    pixel.add_patch(Rectangle((0, 0), 1, 1, fc=shades[int(owners[row[0][cell]])], ec="none"))
+    for quarter, (right, down) in enumerate(reference.CORNERS.astype(int)):
+        rays = reference.rays_of(found, (cell[0] - down, cell[1] - right))
+        for polygon, beside in reference.regions_of(rays):
+            tie, side = rays[beside[0][0]].tie, beside[0][1]
+            shown = owners[found.rows[tie, side]] if found.rows[tie, side] >= 0 else 1
+            pixel.fill(*inside_cell(polygon, quarter, right, down).T, fc=shades[int(shown)], ec="none")
+        for ray in rays:
+            path = np.array(ray.path) + np.array([0.5 - right, 0.5 - down])
+            pixel.plot(*path.T, color=INK, lw=1.8)
+            pixel.plot(*path[0], "D", ms=5, mfc="white", mec=INK, zorder=5)
+    pixel.add_patch(Rectangle((0, 0), 1, 1, fc="none", ec=GREEN, lw=1.3))
+    pixel.plot(0.5, 0.5, "o", ms=6, color=(ORANGE, BLUE)[int(owners[row[0][cell]])], zorder=6)
+    bare(pixel, "outlines cut the pixel into regions;\nits centre shows one of them")
+    pixel.set(xlim=(-0.3, 1.3), ylim=(1.3, -0.3), aspect="equal")
+    here = stencil.color_cell == cell[0] * row.shape[2] + cell[1]
+    weights = {int(row[0][cell]): 1.0}
+    for sample, weight in zip(stencil.color_sample[here], stencil.color_weight[here], strict=True):
+        weights[int(sample)] = weights.get(int(sample), 0.0) + float(weight)
+    order = sorted(weights, key=lambda sample: (owners[sample], -weights[sample]))
+    for place, sample in enumerate(order):
+        table.barh(place, weights[sample], color=(ORANGE, BLUE)[int(owners[sample])], height=0.7)
+        name = "centre" if sample == row[0][cell] else "beside a break"
+        table.text(weights[sample] + 0.02, place, f"{weights[sample]:.3f}   {name}", va="center", fontsize=8)
+    table.set(xlim=(0, 1.15), ylim=(len(order) - 0.4, -0.6), yticks=range(len(order)))
+    table.set_yticklabels([f"sample {sample}" for sample in order], fontsize=8)
+    near = sum(w for sample, w in weights.items() if owners[sample] == 0)
+    table.set_title(
+        f"its row of A: weights of samples' colours, of the near\ncard (orange) {near:.3f} in all, of both"
+        f" {sum(weights.values()):.3f}", fontsize=9, color=INK,
+    )  # fmt: skip
     return made
 
 
@@ -309,7 +377,7 @@ def fields() -> Figure:
     return made
 
 
-FIGURES = {f.__name__: f for f in (pipeline, gap, edge, fields, layers)}
+FIGURES = {f.__name__: f for f in (pipeline, gap, matrix, edge, fields, layers)}
 
 
 def main() -> None:
