@@ -267,16 +267,6 @@ def _on_white(image: np.ndarray) -> np.ndarray:
     return np.clip(image[..., :3], -1e30, 1e30) + (1 - np.clip(image[..., 3:], 0, 1))
 
 
-def read_texture(path: Path, referrer: Path) -> np.ndarray:
-    """The result of `pixels` for an image file that `referrer` names; an InputError if it is missing or unreadable."""
-    if not path.is_file():
-        raise InputError(
-            f"{referrer} refers to the texture {path.name!r}, but there is no file {path}; put it there, or "
-            f"remove the reference to load without it"
-        )
-    return read_image(path)
-
-
 def read_image(path: Path) -> np.ndarray:
     """The result of `pixels` for an image file; an InputError if it cannot be read."""
     return decoded(path, str(path), lambda what: InputError(f"{what}; export it again, as PNG for example"))

@@ -13,18 +13,23 @@ import numpy as np
 from rts.errors import InputError
 from rts.files.bump_maps import holds_normals, normals_of_heights
 from rts.files.damaged_files import contents, lines_of, warn
-from rts.files.images import read_texture
+from rts.files.images import read_image
 from rts.files.paths import inside
 from rts.files.srgb import decode_srgb
 
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
-# What follows -bm is its value, whatever it is, unless that leaves no name.
-_MAP_OPTIONS = re.compile(rf"^(?:(?:-bm\s+(?!-[a-z])\S+\s+(?=\S)|-[a-z]+\s+)(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+# What follows these options is a value, whatever it is, unless that leaves no name.
+_WORDS = "bm|colorspace|imfchan|texres|type"
+_MAP_OPTIONS = re.compile(
+    rf"^(?:(?:-(?:{_WORDS})\s+(?!-[a-z])\S+\s+(?=\S)|-[a-z]+\s+)(?:{_VALUE}\s+)*)+", re.IGNORECASE
+)
 _OPTION = re.compile(r"(-[a-z]+)\s+((?:[^-\s]\S*\s+|-[\d.]\S*\s+)*)", re.IGNORECASE)
 _USUAL = {"-s": {1.0}, "-o": {0.0}, "-t": {0.0}, "-bm": {1.0}, "-mm": {0.0, 1.0}}
 """Options of numbers → those that change nothing."""
 _SWITCHES = {"-blendu": "on", "-blendv": "on", "-cc": "off", "-clamp": "off"}
+_COLORS = ("map_kd", "map_ke", "map_ks")
+"""Maps of colours, which are sRGB; numbers of others are linear."""
 _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
 """A comment by which MeshLab signs; its Tr is 1 for opaque materials."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
@@ -60,6 +65,7 @@ class MtlMaterial(NamedTuple):
         multiplier: the option -bm of "bump", by which its slopes are multiplied.
         unread: statements of other maps.
         options: options of maps that are read, which are not followed: "-s of map_kd", for instance.
+        missing: statements of maps whose files are not there, and the names of these. All else is as without them.
     """
 
     color: np.ndarray | None = None
@@ -69,19 +75,20 @@ class MtlMaterial(NamedTuple):
     multiplier: float = 1.0
     unread: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
-    def entries(self, referrer: Path) -> tuple[dict[str, np.ndarray] | None, bool]:
-        """Entries of θ for the shader `pbr`, linear, None if the material has none; `referrer` is for errors.
+    def entries(self) -> tuple[dict[str, np.ndarray] | None, bool]:
+        """Entries of θ for the shader `pbr`, linear, None if the material has none.
 
         With it, True where map_Bump has the colours of a normal map, and is taken for one.
 
         Raises:
-            InputError: a map is missing or cannot be read.
+            InputError: a map cannot be read.
         """
         entries = {name: decode_srgb(x) if name == "emissive" else x for name, x in self.numbers.items()}
         mistaken = False
         for name, file in self.maps.items():
-            pixels = read_texture(file, referrer)[..., :3]
+            pixels = read_image(file)[..., :3]
             match name:
                 case "emissive":
                     entries[name] = decode_srgb(pixels)
@@ -129,8 +136,10 @@ def read_mtl(library: Path, folder: Path) -> dict[str, MtlMaterial]:
                 current.setdefault("options", {})[key] = _unfollowed(key, rest)
             if key == "map_kd":
                 current["texture"] = file
+                current.setdefault("files", {})[key] = "texture", file
             elif key in MAPS:
                 current.setdefault("maps", {})[MAPS[key]] = file
+                current.setdefault("files", {})[key] = MAPS[key], file
             else:
                 current.setdefault("unread", {})[key] = file
         elif key in NUMBERS and len(values) in ((1, 3) if key == "ke" else (1,)):
@@ -146,7 +155,8 @@ def _unfollowed(key: str, rest: str) -> list[str]:
         try:
             usual = {float(word) for word in words} <= _USUAL.get(name, set())
         except ValueError:
-            usual = words == [_SWITCHES.get(name)]
+            space = "srgb" if key in _COLORS else "linear"
+            usual = words == [space if name == "-colorspace" else _SWITCHES.get(name)]
         if not usual and (key, name) != ("map_bump", "-bm"):
             found.append(name)
     return found
@@ -187,6 +197,13 @@ def _numbers(library: Path, number: int, text: str) -> list[float]:
 
 
 def _material(values: dict[str, Any]) -> MtlMaterial:
+    values = {**values, "maps": dict(values.get("maps", {})), "options": dict(values.get("options", {}))}
+    missing = []
+    for key, (kind, file) in values.get("files", {}).items():
+        if kind != "specular" and not file.is_file():
+            missing.append(f"{file.name!r} ({key})")
+            values["options"].pop(key, None)
+            (values if kind == "texture" else values["maps"]).pop(kind, None)
     color, alpha = values.get("color"), values.get("alpha", 1.0)
     if "texture" in values:
         color = None if alpha >= 1 else np.ones(3)
@@ -197,7 +214,7 @@ def _material(values: dict[str, Any]) -> MtlMaterial:
         numbers.pop("emissive", None)
     # The map of the ambient colour is mostly that of the diffuse one.
     unread = [key for key, file in values.get("unread", {}).items() if file != texture]
-    maps, options = dict(values.get("maps", {})), dict(values.get("options", {}))
+    maps, options = values["maps"], values["options"]
     if {"normal_map", "bump"} <= {*maps}:
         del options["map_bump"]
         if maps.pop("bump") != maps["normal_map"]:
@@ -205,5 +222,9 @@ def _material(values: dict[str, Any]) -> MtlMaterial:
     if {*maps} == {"specular"} and not numbers:
         del maps["specular"], options["map_ks"]
         unread.insert(0, "map_ks")
+    if "specular" in maps and not maps["specular"].is_file():
+        missing.append(f"{maps.pop('specular').name!r} (map_ks)")
+        del options["map_ks"]
     unfollowed = [f"{name} of {key}" for key, names in options.items() for name in names]
-    return MtlMaterial(color, texture, numbers, maps, values.get("multiplier", 1.0), tuple(unread), tuple(unfollowed))
+    multiplier = values.get("multiplier", 1.0)
+    return MtlMaterial(color, texture, numbers, maps, multiplier, tuple(unread), tuple(unfollowed), tuple(missing))

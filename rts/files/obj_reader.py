@@ -12,7 +12,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.files import polygons
 from rts.files.damaged_files import contents, is_plain, lines_of, warn, without_comment
-from rts.files.images import read_texture
+from rts.files.images import read_image
 from rts.files.model_pieces import Piece
 from rts.files.mtl_reader import MtlMaterial, read_mtl
 from rts.files.paths import inside
@@ -27,7 +27,9 @@ LEFT_OUT = frozenset(
     "shadow_obj trace_obj ctech stech call csh maplib usemap bzp bsp cdc cdp res".split()
 )
 """Statements of the format that say nothing about polygons."""
+_MISSING = "pictures that are not there, and is loaded without them"
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
+_NAMES = {"v": "vertices", "vt": "texture coordinates", "vn": "normals"}
 _FAR = 2**40
 """More rows than there may be."""
 _NUMERIC = re.compile(r"[-+./eE\s]*\d[-+./eE\d\s]*")
@@ -134,6 +136,9 @@ class _Lines:
                 index = int(part) if part or key == "v" else None
             except ValueError:
                 raise self.fail(number, f"{part[:60]!r} is no index") from None
+            if index is not None and key != "v" and not (-len(rows) <= index < _FAR and index):
+                indices.append(_FAR)  # It is absent; `polygons` warns of it.
+                continue
             if index is not None and index < -len(rows):
                 raise self.fail(number, f"the index {part[:60]} counts back further than the {len(rows)} rows so far")
             if index is not None and not 0 != index < _FAR:
@@ -142,8 +147,8 @@ class _Lines:
         return tuple(indices)
 
     def _beyond(self, number: int, index: Any, key: str) -> InputError:
-        count, name = len(self.lengths[key]), {"v": "vertices", "vt": "texture coordinates", "vn": "normals"}[key]
-        return self.fail(number, f"a face refers to number {index} of {count} {name} (indices count from 1)")
+        count = len(self.lengths[key])
+        return self.fail(number, f"a face refers to number {index} of {count} {_NAMES[key]} (indices count from 1)")
 
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
         """The rows (N, C) of one kind, float64.
@@ -165,14 +170,22 @@ class _Lines:
     def polygons(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Indices of position, uv and normal (H, 3) of all corners; corner count, and material, of each face (F,).
 
-        An index that is not given is −1. Indices beyond the rows are refused.
+        An index that is not given is −1. So is, with a warning, that of a uv or normal which is not there; indices of
+        positions beyond the rows are refused.
         """
         table, faces = np.array(self.corners, np.int64), np.array(self.faces, np.int64)
         for key, indices in zip(LENGTHS, table.T, strict=True):
             beyond = np.flatnonzero(indices >= len(self.lengths[key]))
-            if len(beyond):
-                face = np.searchsorted(np.cumsum(faces[:, 1]), beyond[0], side="right")
-                raise self._beyond(faces[face, 0], indices[beyond[0]] + 1, key)
+            if not len(beyond):
+                continue
+            of = np.unique(np.searchsorted(np.cumsum(faces[:, 1]), beyond, side="right"))
+            if key == "v":
+                raise self._beyond(faces[of[0], 0], indices[beyond[0]] + 1, key)
+            indices[beyond] = -1
+            warn(
+                f"{self.path}, line {faces[of[0], 0]}: {len(of)} of {len(faces)} faces refer to {_NAMES[key]} that are "
+                f"not among the {len(self.lengths[key])} of the file, and are read without these"
+            )
         return table, faces[:, 1], faces[:, 2]
 
 
@@ -214,7 +227,9 @@ def read_polygons(path: Path) -> Polygons:
     materials = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
     material = materials[0] if len(used) == len(materials) == 1 else MtlMaterial()
     corners, sizes, _ = lines.polygons()
-    texture = None if material.texture is None else read_texture(material.texture, path)
+    if material.missing:
+        warn(f"{path} has {_MISSING}: {_some(list(material.missing))}")
+    texture = None if material.texture is None else read_image(material.texture)
     linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
     colors, color, texture = linear
     return Polygons(v[:, :3], colors, vt, sizes, corners, lines.tags, len(used), color, texture)
@@ -248,12 +263,14 @@ def read_obj(path: Path) -> list[Piece]:
     materials = _materials(lines)
     used = {material for _, _, material in lines.faces}
     looks = {name: materials.get(name, MtlMaterial()) for name, index in lines.materials.items() if index in used}
-    textures = {name: read_texture(look.texture, path) for name, look in looks.items() if look.texture is not None}
-    read = {name: look.entries(path) for name, look in looks.items()}
+    textures = {name: read_image(look.texture) for name, look in looks.items() if look.texture is not None}
+    read = {name: look.entries() for name, look in looks.items()}
     unread = [f"{key} of {name!r}" for name, look in looks.items() for key in look.unread]
     options = [f"{option} of {name!r}" for name, look in looks.items() for option in look.options]
+    missing = [f"{what} of {name!r}" for name, look in looks.items() for what in look.missing]
     mistaken = [f"that of {name!r}" for name, (_, taken) in read.items() if taken]
     kinds = (
+        (_MISSING, missing),
         ("maps that are not read", unread),
         ("options of maps that are not followed", options),
         ("bump maps that are taken for normal maps, by their colours", mistaken),

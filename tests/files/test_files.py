@@ -3,6 +3,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -89,7 +90,7 @@ def test_the_texture_of_a_glb_is_upright(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a b.png", "tex.png", "sub/tex.png"])
-@pytest.mark.parametrize("line", ["map_Kd {} ", "map_Kd -s 1 1 1 -clamp off {}", "map_kd\t{}\r"])
+@pytest.mark.parametrize("line", ["map_Kd {} ", "map_Kd -s 1 1 1 -clamp off -colorspace sRGB {}", "map_kd\t{}\r"])
 def test_texture_names_are_found_however_they_are_written(tmp_path, name, line):
     (tmp_path / "sub").mkdir()
     [part] = rts.load(textured_quad(tmp_path, name, f"newmtl m\nKd 0 0 0\n{line}\n"))
@@ -483,8 +484,6 @@ def test_a_gltf_that_is_compressed_in_a_way_that_is_not_read_is_warned_of_or_ref
         ("m.obj", QUAD + "f 1 2 5\n", "line 5: a face refers to number 5 of 4 vertices"),
         ("m.obj", QUAD + "f 0 1 2\n", "line 5: a face refers to number 0 of 4 vertices"),
         ("m.obj", QUAD + "f -5 1 2\n", "line 5: the index -5 counts back further"),
-        ("m.obj", QUAD + "f 1/1 2/1 3/1\n", "number 1 of 0 texture coordinates"),
-        ("m.obj", QUAD + "f 1//1 2//1 3//1\n", "number 1 of 0 normals"),
         ("m.obj", QUAD + "f 1 2\n", "line 5: a face has 2 corners"),
         ("m.obj", QUAD + "f 1 2 x\n", "line 5: 'x' is no index"),
         ("m.obj", "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v' has 2 numbers"),
@@ -766,12 +765,49 @@ def test_missing_textures_and_libraries(tmp_path):
     with pytest.raises(InputError, match="cannot be read as an image"):
         rts.load(path)
     (tmp_path / "tex.png").unlink()
-    with pytest.raises(InputError, match="refers to the texture 'tex.png'"):
-        rts.load(path)
+    with pytest.warns(rts.errors.FileWarning, match=r"pictures that are not there, .*: 'tex.png' \(map_kd\) of 'm'$"):
+        [part] = rts.load(path)
+    assert "uv" in part.theta and "texture" not in part.theta
     (tmp_path / "quad.mtl").unlink()
     with pytest.warns(UserWarning, match="material library 'quad.mtl'"):
         [part] = rts.load(path)
     assert "uv" in part.theta
+
+
+@pytest.mark.parametrize(
+    ("corners", "uv", "normals", "said"),
+    [
+        ("1/1/1 2/2/1 3/3/1", False, False, [r"1 of 2 faces refer to texture coordinates .* 0 of the file", "normals"]),
+        ("1//1 2//1 3//1", False, False, ["normals that are not among the 0"]),
+        ("1/1 2/2 3/3", False, False, ["texture coordinates that are not among the 0"]),
+        ("1/-1 2/-2 3/0", False, False, ["texture coordinates that are not among the 0"]),
+        ("1/1 2/2 3/9", True, False, ["texture coordinates that are not among the 4"]),
+        ("1/-9 2/2 3/3", True, False, ["texture coordinates that are not among the 4"]),
+    ],
+)
+def test_texture_coordinates_and_normals_that_are_not_there_are_left_out_with_a_warning(
+    tmp_path, corners, uv, normals, said
+):
+    rows = QUAD + (QUAD_UV if uv else "")
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        [part] = rts.load(write(tmp_path / "m.obj", f"{rows}f {corners}\nf 1 3 4\n"))
+    [text] = [str(w.message) for w in caught]
+    assert f"m.obj, line {9 if uv else 5}: 1 of 2 faces refer to" in text
+    for words in said:
+        assert re.search(words, text)
+    assert ("uv" in part.theta) == uv and "normals" not in part.theta
+    np.testing.assert_array_equal(part.surface.faces, [(0, 1, 2), (0, 2, 3)])
+
+
+def test_a_material_without_its_picture_has_its_colour(tmp_path):
+    path = textured_quad(tmp_path)
+    write(tmp_path / "quad.mtl", "newmtl m\nKd 0.5 0 1\nmap_Kd -s 2 2 1 none.png\nmap_Pr none.png\nPm 1\nd 0.5\n")
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        [part] = rts.load(path)
+    [text] = [str(w.message) for w in caught]
+    assert text.endswith("'none.png' (map_kd) of 'm', 'none.png' (map_pr) of 'm'")
+    np.testing.assert_allclose(part.theta["color"], [0.21404114, 0, 1, 0.5], atol=1e-6)
+    assert part.theta["metallic"] == 1 and "roughness" not in part.theta
 
 
 @pytest.mark.parametrize("name", ["../secret.png", "sub/../../secret.png", "{absolute}", "C:\\secret.png", "link.png"])

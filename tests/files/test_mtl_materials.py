@@ -172,3 +172,12 @@ def test_options_that_are_not_followed_are_named_in_the_same_warning(tmp_path):
         f"{tmp_path / 'm.obj'} has maps that are not read: map_d of 'm'; and options of maps that are not followed: "
         "-s of map_kd of 'm', -o of map_kd of 'm', -clamp of map_kd of 'm' and 1 more"
     )
+
+
+def test_colour_spaces_of_maps_are_options_with_a_word(tmp_path):
+    picture(tmp_path, "t 1.png", (255, 0, 0))
+    part = loaded(tmp_path, "map_Kd -colorspace sRGB t 1.png\nmap_Pr -s 1 1 1 -colorspace Linear -clamp off t 1.png")
+    np.testing.assert_array_equal(part.theta["texture"], [[[1, 0, 0]]])
+    np.testing.assert_array_equal(part.theta["roughness"], [[[1]]])
+    with pytest.warns(rts.errors.FileWarning, match="not followed: -colorspace of map_kd of 'm', -texres of map_pr"):
+        loaded(tmp_path, "map_Kd -colorspace linear t 1.png\nmap_Pr -texres 512x512 t 1.png")
