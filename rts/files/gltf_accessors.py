@@ -54,6 +54,7 @@ class Accessor:
         content: the bytes of its bufferView; None for rows of zeros, which have no data.
         start: the byte of the first row there.
         stride: bytes from one row to the next.
+        others: for sparse accessors, the places (K,) of rows that differ from these, and these rows (K, C); or None.
     """
 
     index: int
@@ -64,6 +65,12 @@ class Accessor:
     content: bytes | None = None
     start: int = 0
     stride: int = 0
+    others: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """True if it has no data of its own, neither for all rows nor for some."""
+        return self.content is None and self.others is None
 
     @property
     def row(self) -> int:
@@ -73,10 +80,15 @@ class Accessor:
     def rows(self) -> np.ndarray:
         """(N, C) of its own type."""
         if self.content is None:
-            return np.zeros((self.count, self.width), self.component)
-        content = np.frombuffer(self.content, np.uint8)[self.start :]
-        rows = np.lib.stride_tricks.as_strided(content, (self.count, self.row), (self.stride, 1))
-        return np.ascontiguousarray(rows).view(self.component)
+            rows = np.zeros((self.count, self.width), self.component)
+        else:
+            content = np.frombuffer(self.content, np.uint8)[self.start :]
+            rows = np.lib.stride_tricks.as_strided(content, (self.count, self.row), (self.stride, 1))
+            rows = np.ascontiguousarray(rows).view(self.component)
+        if self.others is not None:
+            rows = rows.copy()
+            rows[self.others[0]] = self.others[1]
+        return rows
 
     def numbers(self, fractions: bool = False) -> np.ndarray:
         """(N, C) float32; integers as the fractions they stand for, if they are `normalized` or `fractions` says so."""
@@ -95,6 +107,8 @@ def read_accessor(gltf: Gltf, index: int) -> Accessor:
     if json["type"] not in WIDTHS:
         raise fail(f"accessor {index} has type {json['type']!r}; expected one of {', '.join(WIDTHS)}")
     accessor = Accessor(index, json, np.dtype("<" + TYPES[json["componentType"]]), WIDTHS[json["type"]], count)
+    if "sparse" in json:
+        accessor = replace(accessor, others=_others(gltf, accessor, json["sparse"]))
     if "bufferView" not in json:
         return accessor
     view, row, size = count_of(json["bufferView"]), accessor.row, accessor.component.itemsize
@@ -111,6 +125,31 @@ def read_accessor(gltf: Gltf, index: int) -> Accessor:
     return replace(accessor, content=content, start=start, stride=stride)
 
 
+def _others(gltf: Gltf, accessor: Accessor, sparse: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The places and rows of `Accessor.others`; refused if they are not in their views, or not in ascending order."""
+    name, count, fail = f"the sparse rows of accessor {accessor.index}", count_of(sparse["count"]), gltf.fail
+    kind = sparse["indices"]["componentType"]
+    if count_of(kind) not in (5121, 5123, 5125):
+        raise fail(f"indices of {name} have componentType {kind}; expected 5121, 5123 or 5125")
+    tables = []
+    for part, dtype, width in (
+        ("indices", np.dtype("<" + TYPES[kind]), 1),
+        ("values", accessor.component, accessor.width),
+    ):
+        content, start = gltf.views[count_of(sparse[part]["bufferView"])], count_of(sparse[part].get("byteOffset", 0))
+        end = start + count * width * dtype.itemsize
+        if end > len(content) or start % dtype.itemsize:
+            raise fail(
+                f"{part} of {name} go from byte {start} to {end} of {len(content)}; expected them inside, from a "
+                f"multiple of {dtype.itemsize} on"
+            )
+        tables.append(np.frombuffer(content[start:end], dtype).reshape(count, width))
+    places = tables[0][:, 0].astype(np.int64)
+    if (np.diff(places) <= 0).any() or places.max(initial=0) >= max(accessor.count, 1):
+        raise fail(f"indices of {name} are {places[:9].tolist()}; expected ascending ones below {accessor.count}")
+    return places, tables[1]
+
+
 def read_table(gltf: Gltf, name: str, kind: str, index: int, accessors: list[Accessor]) -> np.ndarray:
     """The numbers (N, C) float32 of an accessor of a kind in `TABLES`; refused if of another type, or not finite.
 
@@ -119,8 +158,6 @@ def read_table(gltf: Gltf, name: str, kind: str, index: int, accessors: list[Acc
     if count_of(index) >= len(accessors):
         raise gltf.fail(f"{name} is accessor {index}, and there are {len(accessors)}")
     accessor = accessors[index]
-    if "sparse" in accessor.json:
-        raise gltf.fail(f"{name} is sparse, which is not read")
     _check_types(name, kind, accessor, gltf.uses(QUANTIZATION), gltf.fail)
     numbers = accessor.numbers()
     if not np.isfinite(numbers).all():
@@ -139,20 +176,21 @@ def read_attributes(
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     used = {kind: accessors[count_of(index)] for kind, index in used.items()}
     for kind, accessor in used.items():
-        if "sparse" in accessor.json:
-            raise fail(f"{kind} of {name} is sparse, which is not read")
         _check_types(f"{kind} of {name}", kind, accessor, gltf.uses(QUANTIZATION), fail)
     count = used["POSITION"].count
     for kind in attributes:
         if used[kind].count != count:
             raise fail(f"{kind} of {name} has {used[kind].count} rows, and POSITION {count}")
-    if used["POSITION"].content is None:
-        extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
-        raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
+    if used["POSITION"].is_empty:
+        extensions = [*primitive.get("extensions", {})]
+        named = ", ".join(extensions) or "none is named"
+        raise gltf.compressed(
+            f"{name} has no data of its own, and the extension that has them is not read: {named}", extensions
+        )
     read = {kind: accessor for kind, accessor in used.items() if kind in ATTRIBUTES}
     _check_overlap(name, {k: a for k, a in read.items() if k != "indices" and a.content is not None and count}, fail)
     for kind in ("POSITION", "indices"):
-        if kind in read and read[kind].content is not None and read[kind].count:
+        if kind in read and not read[kind].is_empty and read[kind].count:
             _check_bounds(gltf, f"{kind} of {name}", read[kind])
     return read, _corners(name, primitive.get("mode", 4), count, read.pop("indices", None), fail)
 
@@ -229,9 +267,9 @@ def _corners(name: str, mode: int, count: int, indices: Accessor | None, fail: F
     corners, owner = np.arange(count), f"POSITION of {name}"
     if indices is not None:
         owner = f"accessor {indices.index}, the indices of {name},"
-        if indices.content is None:
+        if indices.is_empty:
             raise fail(f"{owner} has no data")
-        if indices.stride != indices.row:
+        if indices.content is not None and indices.stride != indices.row:
             raise fail(f"{owner} has rows {indices.stride} bytes apart; expected them one after the other")
         corners = indices.rows().ravel().astype(np.int64)
         if corners.max(initial=0) >= count:

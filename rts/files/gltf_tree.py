@@ -30,6 +30,20 @@ LIGHTS = "KHR_lights_punctual"
 """The extension of lights."""
 TOLD = "EXT_mesh_gpu_instancing"
 """An extension of which reading scenes warns."""
+_COPY = "decode it by `gltf-transform copy model.glb decoded.glb`, of the package @gltf-transform/cli of npm"
+DECODERS = {
+    "KHR_draco_mesh_compression": f"{_COPY}, or export it again from Blender, without compression",
+    "EXT_meshopt_compression": f"{_COPY}, or by gltfpack without its option -c",
+    "KHR_meshopt_compression": "export it again without compression, such as by gltfpack without its option -c",
+}
+"""What to do about an extension that is not read."""
+LISTS = frozenset(
+    "accessors animations buffers bufferViews cameras images materials meshes nodes samplers scenes skins "
+    "textures".split()
+)
+"""Lists of objects of the whole."""
+_INNER_LISTS = {"primitives", "targets", "channels"}
+_INNER_OBJECTS = {"extensions", "attributes", "sparse", "pbrMetallicRoughness", "perspective", "orthographic"}
 PROPERTIES = {
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
     "bufferViews": "buffer byteOffset byteLength byteStride target",
@@ -75,6 +89,8 @@ class Gltf:
         self.fail: Fail = lambda what: unreadable(path, kind, what)
         text, self._binary = self._parts(data) if kind == "GLB" else (data, None)
         self.tree: dict[str, Any] = self.part("its tree", _tree, text)
+        if wrong := _wrong_kind(self.tree):
+            raise self.fail(f"its tree: {wrong}")
         self.part("its tree", self._check_extensions)
         self._buffers = self.each("buffers", self._buffer)
         self.views = self.each("bufferViews", self._view)
@@ -88,6 +104,12 @@ class Gltf:
         except Exception as error:  # Anything may be missing, or of another kind.
             said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
             raise self.fail(f"{name}: {f'{error} is missing' if isinstance(error, KeyError) else said}") from error
+
+    def compressed(self, what: str, extensions: list[str]) -> InputError:
+        """The error of a file that needs extensions which are not read: what is wrong, and what to do about these."""
+        known = [DECODERS[name] for name in extensions if name in DECODERS]
+        advice = known[0] if known else "export it again without this extension"
+        return InputError(f"{self.path} cannot be read ({what}); {advice}")
 
     def each(self, kind: str, read: Callable[[int, Any], Any]) -> list[Any]:
         """The results of a function (index, JSON) of all objects of a kind, such as "accessors"."""
@@ -170,8 +192,8 @@ class Gltf:
             raise self.fail(f"it is of version {version!r} of glTF; expected 2.0")
         required = tree.get("extensionsRequired", [])
         unknown = [name for name in required if name not in READ and not APPEARANCE.match(str(name))]
-        if unknown or not isinstance(required, list):
-            raise self.fail(f"it requires the extension {(unknown or [required])[0]!r}, which is not read")
+        if unknown:
+            raise self.compressed(f"it requires the extension {unknown[0]!r}, which is not read", unknown)
         holders = [*tree.get("bufferViews", []), *(p for mesh in tree.get("meshes", []) for p in mesh["primitives"])]
         holders += tree.get("materials", [])
         used = [*tree.get("extensionsUsed", []), *(name for holder in holders for name in holder.get("extensions", {}))]
@@ -190,8 +212,11 @@ class Gltf:
             content = self._binary or b""
         promised = count_of(buffer["byteLength"])
         if promised > len(content):
-            unread = f", and the extension that has them is not read: {', '.join(extensions)}" if extensions else ""
-            raise self.fail(f"buffer {index} promises {promised} bytes, and has {len(content)}{unread}")
+            what = f"buffer {index} promises {promised} bytes, and has {len(content)}"
+            if extensions:
+                unread = f"{what}, and the extension that has them is not read: {', '.join(extensions)}"
+                raise self.compressed(unread, [*extensions])
+            raise self.fail(what)
         return content
 
     def _named(self, uri: str) -> bytes:
@@ -216,6 +241,42 @@ def _tree(text: bytes) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise ValueError("the whole is no object")
     return tree
+
+
+def _wrong_kind(tree: dict[str, Any]) -> str:
+    """Which part of the tree is no list or object, though it ought to be one; "" if all are what they ought to be."""
+    for name in ("extensionsUsed", "extensionsRequired"):
+        if not _is_list(tree.get(name, []), str):
+            return f"{name} is {_shown(tree[name])}; expected a list of names"
+    if not isinstance(tree.get("asset", {}), dict):
+        return f"asset is {_shown(tree['asset'])}; expected an object"
+    for name in sorted(LISTS & {*tree}):
+        if not _is_list(tree[name], dict):
+            return f"{name} is {_shown(tree[name])}; expected a list of objects"
+    ahead = [(f"{name} {i}", entry) for name in sorted(LISTS & {*tree}) for i, entry in enumerate(tree[name])]
+    while ahead:
+        place, entry = ahead.pop()
+        for name, value in entry.items():
+            if name in _INNER_LISTS and not _is_list(value, dict):
+                return f"{name} of {place} is {_shown(value)}; expected a list of objects"
+            if name in _INNER_OBJECTS and not isinstance(value, dict):
+                return f"{name} of {place} is {_shown(value)}; expected an object"
+            if name == "extensions" and (wrong := [key for key, x in value.items() if not isinstance(x, dict)]):
+                return f"{wrong[0][:60]} of {place} is {_shown(value[wrong[0]])}; expected an object"
+            if name in _INNER_LISTS - {"targets"}:
+                ahead += [(place, inner) for inner in value]
+            elif name == "extensions":
+                ahead += [(place, inner) for inner in value.values()]
+    return ""
+
+
+def _is_list(value: Any, kind: type) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _no_number(name: str) -> float:

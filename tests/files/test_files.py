@@ -473,6 +473,128 @@ def test_a_gltf_that_is_compressed_in_a_way_that_is_not_read_is_warned_of_or_ref
             rts.load(write(path, json.dumps(tree)))
 
 
+COPY = "decode it by `gltf-transform copy model.glb decoded.glb`, of the package @gltf-transform/cli of npm, or"
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("KHR_draco_mesh_compression", f"{COPY} export it again from Blender, without compression"),
+        ("EXT_meshopt_compression", f"{COPY} by gltfpack without its option -c"),
+        ("KHR_meshopt_compression", "export it again without compression, such as by gltfpack without its option -c"),
+        ("X_shapes", "export it again without this extension"),
+    ],
+)
+def test_what_to_do_about_an_extension_that_is_not_read_is_said_of_each(tmp_path, name, advice):
+    mesh = trimesh.Trimesh(*GRID, process=False)
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)
+    path, text = tmp_path / "m.gltf", files["model.gltf"].decode()
+    required, elsewhere, fallback = (json.loads(text) for _ in range(3))
+    required["extensionsUsed"] = required["extensionsRequired"] = [name]
+    primitive = elsewhere["meshes"][0]["primitives"][0]
+    primitive["extensions"] = {name: {}}
+    del elsewhere["accessors"][primitive["attributes"]["POSITION"]]["bufferView"]
+    fallback["buffers"].append({"byteLength": 9, "extensions": {name: {"fallback": True}}})
+    for tree in (required, elsewhere, fallback):
+        with warnings.catch_warnings(), pytest.raises(InputError) as error:
+            warnings.simplefilter("ignore")
+            rts.load(write(path, json.dumps(tree)))
+        assert message(error).endswith(f"; {advice}") and "cut short" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            {"extensionsUsed": "KHR_materials_unlit"},
+            'extensionsUsed is "KHR_materials_unlit"; expected a list of names',
+        ),
+        ({"extensionsRequired": [1]}, "extensionsRequired is [1]; expected a list of names"),
+        ({"asset": "2.0"}, 'asset is "2.0"; expected an object'),
+        ({"meshes": {"0": {}}}, 'meshes is {"0": {}}; expected a list of objects'),
+        ({"nodes": ["a"]}, 'nodes is ["a"]; expected a list of objects'),
+        ({"meshes": [{"primitives": 3}]}, "primitives of meshes 0 is 3; expected a list of objects"),
+        ({"meshes": [{"primitives": [{"attributes": []}]}]}, "attributes of meshes 0 is []; expected an object"),
+        ({"materials": [{"pbrMetallicRoughness": 1}]}, "pbrMetallicRoughness of materials 0 is 1; expected an object"),
+        ({"materials": [{"extensions": "KHR_x"}]}, 'extensions of materials 0 is "KHR_x"; expected an object'),
+        ({"materials": [{"extensions": {"KHR_x": True}}]}, "KHR_x of materials 0 is true; expected an object"),
+        ({"accessors": [{"sparse": [1]}]}, "sparse of accessors 0 is [1]; expected an object"),
+    ],
+)
+def test_a_part_of_a_gltf_of_another_kind_is_named(tmp_path, change, expected):
+    mesh = trimesh.Trimesh(*GRID, process=False)
+    tree = json.loads(trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)["model.gltf"])
+    with pytest.raises(InputError) as error:
+        rts.load(write(tmp_path / "m.gltf", json.dumps(tree | change)))
+    assert f"cannot be read as GLTF (its tree: {expected})" in message(error)
+
+
+def with_sparse(path, accessor, indices, values, /, *, base=True, **changes):
+    """A glTF, one of whose accessors has other rows at some places, or rows of zeros elsewhere."""
+    tree = json.loads(path.read_text())
+    parts = {}
+    for name, array in (("indices", indices), ("values", values)):
+        data = base64.b64encode(bytes(4) + array.tobytes()).decode()
+        tree["buffers"].append({"uri": f"data:;base64,{data}", "byteLength": 4 + array.nbytes})
+        tree["bufferViews"].append({"buffer": len(tree["buffers"]) - 1, "byteLength": 4 + array.nbytes})
+        parts[name] = {"bufferView": len(tree["bufferViews"]) - 1, "byteOffset": 4}
+    parts["indices"]["componentType"] = {1: 5121, 2: 5123, 4: 5125}[indices.dtype.itemsize]
+    entry = tree["accessors"][accessor]
+    entry["sparse"] = {"count": len(indices), **parts}
+    for key in ("min", "max", *([] if base else ["bufferView", "byteOffset"])):
+        entry.pop(key, None)
+    for name, change in changes.items():
+        (entry["sparse"] if name == "whole" else entry["sparse"][name]).update(change)
+    return write(path, json.dumps(tree))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+@pytest.mark.parametrize("base", [True, False], ids=["others", "zeros"])
+def test_sparse_accessors_have_other_rows_at_some_places(tmp_path, dtype, base):
+    path = gltf_with(tmp_path, "COLOR_0", np.full((4, 3), 0.25, np.float32), 5126, "VEC3")
+    tree = json.loads(path.read_text())
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    colors = np.float32([(1, 0.5, 0), (0, 0.5, 1)])
+    with_sparse(path, attributes["COLOR_0"], np.array([1, 3], dtype), colors, base=base)
+    moved = np.float32([(1, 0, 2), (1, 1, 3), (0, 1, 4)])
+    with_sparse(path, attributes["POSITION"], np.array([1, 2, 3], dtype), moved, base=base)
+    [part] = rts.load(path, weld=False)
+    np.testing.assert_array_equal(part.theta["vertices"], [(0, 0, 0), *moved])
+    rest = 0.25 if base else 0
+    np.testing.assert_allclose(part.theta["colors"], [[rest] * 3, colors[0], [rest] * 3, colors[1]])
+
+
+def test_the_corners_of_faces_may_be_sparse(tmp_path):
+    path = gltf_with(tmp_path, "COLOR_0", np.ones((4, 3), np.float32), 5126, "VEC3")
+    tree = json.loads(path.read_text())
+    indices = tree["meshes"][0]["primitives"][0]["indices"]
+    dtype = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32}[tree["accessors"][indices]["componentType"]]
+    [part] = rts.load(with_sparse(path, indices, np.array([1, 4], np.uint8), np.array([3, 1], dtype)), weld=False)
+    np.testing.assert_array_equal(part.surface.faces, [(0, 3, 2), (0, 1, 3)])
+
+
+@pytest.mark.parametrize(
+    ("indices", "changes", "expected"),
+    [
+        ([1, 1], {}, "indices of the sparse rows of accessor .* are \\[1, 1\\]; expected ascending ones below 4"),
+        ([2, 1], {}, "expected ascending ones"),
+        ([1, 4], {}, "expected ascending ones below 4"),
+        ([0, 1], {"whole": {"count": 3}}, "indices of the sparse rows of accessor .* from byte 4 to 7 of 6"),
+        ([0, 1], {"values": {"byteOffset": 8}}, "values of the sparse rows of accessor .* from byte 8 to 32 of 28"),
+        ([0, 1], {"values": {"byteOffset": 3}}, "expected them inside, from a multiple of 4 on"),
+        ([0, 1], {"indices": {"componentType": 5126}}, "have componentType 5126; expected 5121, 5123 or 5125"),
+        ([0, 1], {"indices": {"bufferView": 99}}, "accessor"),
+        ([0, 1], {"whole": {"values": None}}, "accessor"),
+    ],
+)
+def test_wrong_sparse_accessors_are_refused(tmp_path, indices, changes, expected):
+    path = gltf_with(tmp_path, "COLOR_0", np.ones((4, 3), np.float32), 5126, "VEC3")
+    last = len(json.loads(path.read_text())["accessors"]) - 1
+    with_sparse(path, last, np.array(indices, np.uint8), np.ones((2, 3), np.float32), **changes)
+    with pytest.raises(InputError, match=expected):
+        rts.load(path)
+
+
 # --------------------------------------------------------------------------------------------- what does not
 
 

@@ -133,6 +133,19 @@ def test_nodes_without_a_skin_carry_their_parts_and_morph_targets(bar, tmp_path)
     np.testing.assert_allclose(posed(model, "wave", 0.5), 1.75 * VERTICES)
 
 
+def test_displacements_of_morph_targets_may_be_sparse(bar, tmp_path):
+    places, moved = np.array([2, 5], np.uint16), np.float32([(0, 0, 3), (1, 0, 0)])
+    bar.add(places), bar.add(moved)
+    first, second = ({"bufferView": len(bar.views) - n} for n in (2, 1))
+    sparse = {"count": 2, "indices": {**first, "componentType": 5123}, "values": second}
+    bar.accessors.append({"componentType": 5126, "count": 6, "type": "VEC3", "sparse": sparse})
+    bar.primitive["targets"] = [{"POSITION": len(bar.accessors) - 1}]
+    model = rts.load_model(bar.written(tmp_path), weld=False)
+    wanted = np.zeros((1, 6, 3))
+    wanted[0, places] = moved
+    np.testing.assert_array_equal(model.parts[0].theta["morph_vertices"], wanted)
+
+
 def test_interpolation_by_steps_and_by_cubics():
     times, values = np.array([1.0, 3.0]), np.array([[0.0], [8.0]])
     assert [Channel(0, "weights", times, values, "STEP").at(t)[0] for t in (0, 1, 2.9, 3, 9)] == [0, 0, 0, 8, 8]
@@ -186,7 +199,10 @@ DAMAGES = {
     "a clip twice": (lambda bar: bar.clip["channels"].append(bar.clip["channels"][0]), "two channels for rotation"),
     "weights of no targets": (lambda bar: bar.clip["channels"][0]["target"].update(path="weights"), "is of VEC4"),
     "a rotation of zero": (lambda bar: bar.sampler.update(output=bar.add(np.zeros((3, 4)))), "a rotation of length 0"),
-    "sparse matrices": (lambda bar: bar.accessors[bar.skin["inverseBindMatrices"]].update(sparse={}), "is sparse"),
+    "sparse matrices": (
+        lambda bar: bar.accessors[bar.skin["inverseBindMatrices"]].update(sparse={}),
+        "'count' is missing",
+    ),
     "displacements of other rows": (
         lambda bar: bar.primitive.update(targets=[{"POSITION": bar.add(np.zeros((5, 3)))}]),
         "has 5 rows, and POSITION 6",
