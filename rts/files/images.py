@@ -21,6 +21,7 @@ from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, InputError, PluginError
 from rts.files.bright_images import read_exr, read_hdr, write_exr, write_hdr
 from rts.files.damaged_files import Fail, gathered, warn, warn_once
+from rts.files.deep_images import is_deep, read_deep
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.shading.tone_mapping import check_exposure, tonemap
@@ -273,12 +274,19 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def decoded(source: Path | bytes, name: str, fail: Fail) -> np.ndarray:
-    """The result of `pixels` for a file or its bytes; an error, `fail` of a text with `name`, if it cannot be read."""
+    """The result of `pixels` for a file or its bytes, of 16 bits where a PNG has them.
+
+    An error, `fail` of a text with `name`, if it cannot be read.
+    """
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
-            return pixels(image)
+            found = pixels(image)
+            if image.format != "PNG":
+                return found
+        data = source if isinstance(source, bytes) else source.read_bytes()
+        return _with_alpha_if_any(read_deep(data)) if is_deep(data) else found
     except Exception as error:  # Pillow's decoders raise many kinds, SyntaxError and struct.error among them.
         raise fail(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from error
 
@@ -290,5 +298,8 @@ def pixels(image: Any) -> np.ndarray:
     if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would clip to 8.
         grey = np.asarray(image, np.float32) / 65535
         return np.repeat(np.clip(grey, 0, 1)[..., None], 3, axis=2)
-    rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
+    return _with_alpha_if_any(np.asarray(image.convert("RGBA"), np.float32) / 255)
+
+
+def _with_alpha_if_any(rgba: np.ndarray) -> np.ndarray:
     return rgba if (rgba[..., 3] < 1).any() else np.ascontiguousarray(rgba[..., :3])

@@ -35,7 +35,8 @@ from rts.shading.textures import own_uv
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh", cull: str = "none") -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, and others that trimesh reads.
 
-    There is one part for each mesh of the scene or, in an OBJ, for each material; in an STL as text, for each solid;
+    There is one part for each mesh of the scene or, in an OBJ, for each material; in a PLY, for each texture of faces;
+    in an STL as text, for each solid;
     `merge=True` makes them one. θ holds NumPy float32 arrays: "vertices", and where the file has them "uv",
     "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
     are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
@@ -300,7 +301,7 @@ def read_pieces(path: Path) -> list[Piece]:
         case "obj":
             return read_obj(path)
         case "ply":
-            return [read_ply(path, data, file)]
+            return read_ply(path, data, file)
         case "off":
             return [read_off(path, data)]
         case "stl" | "stl_ascii":

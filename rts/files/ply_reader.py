@@ -51,8 +51,8 @@ Columns = dict[str, np.ndarray | Lists]
 """Property's name → column (R,), or lists."""
 
 
-def read_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> Piece:
-    """The mesh of a PLY.
+def read_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> list[Piece]:
+    """The mesh of a PLY; of one with several textures, the faces of each, which share their vertices.
 
     Args:
         path: the path of the file.
@@ -68,13 +68,46 @@ def read_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> Piece:
     def fail(what: str) -> InputError:
         return unreadable(path, "PLY", what)
 
-    elements, layout, texture, start = _header(data, fail)
+    elements, layout, textures, start = _header(data, fail)
     if layout == "ascii":
         tables = _text_tables(elements, len(lines_of(data[:start])) - 1, data[start:], fail)
     else:
         tables = _binary_tables(elements, data, start, ">" if "big" in layout else "<", fail)
-    image = decoded(file(texture), f"its texture {texture}", fail) if texture else None
-    return piece_of(path, _mesh(path, tables, fail), fail)._replace(texture=image)
+    mesh = _mesh(path, tables, fail)
+    piece = piece_of(path, mesh, fail)
+    images = [decoded(file(name), f"its texture {name}", fail) for name in textures]
+    if not images or not len(piece.faces):
+        return [piece._replace(texture=images[0] if images else None)]
+    numbers = _numbers_of_textures(path, mesh, textures)
+    # Triangles are ordered by polygon, n - 2 for each of n corners.
+    of_triangle = np.repeat(numbers, mesh.faces[0] - 2)
+    pieces = []
+    for number in np.unique(of_triangle):
+        its = of_triangle == number
+        attributes = {name: (rows, table[its]) for name, (rows, table) in piece.attributes.items()}
+        image = images[number] if number < len(images) else None
+        pieces.append(piece._replace(faces=piece.faces[its], attributes=attributes, texture=image))
+    return pieces
+
+
+def _numbers_of_textures(path: Path, mesh: PolygonTables, textures: list[str]) -> np.ndarray:
+    """The number (F,) of each face's texture; for faces without one, how many textures there are."""
+    count, faces = len(textures), len(mesh.faces[0])
+    if "texnumber" not in mesh.per_face:
+        if count > 1:
+            warn(
+                f"{path} has {count} textures, and no texnumber of faces: the first, {textures[0]!r}, is taken for all"
+            )
+        return np.zeros(faces, np.int64)
+    numbers = mesh.per_face["texnumber"].astype(np.float64)
+    wrong = ~((numbers >= 0) & (numbers < count) & (numbers == np.floor(numbers)))
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        warn(
+            f"{path}: {int(wrong.sum())} of {faces} faces have a texnumber of none of its {count} textures, such as "
+            f"face {first} with {numbers[first]:g}; they are loaded without"
+        )
+    return np.where(wrong, count, numbers).astype(np.int64)
 
 
 def _mesh(path: Path, tables: dict[str, Columns], fail: Fail) -> PolygonTables:
@@ -115,8 +148,8 @@ def _plainly_named(columns: Columns) -> Columns:
     return columns
 
 
-def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """The header's elements, layout and name of a texture, or ""; and the byte where the data begin.
+def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, list[str], int]:
+    """The header's elements, layout and names of textures; and the byte where the data begin.
 
     The layout is "ascii", "binary_little_endian" or "binary_big_endian".
     """
@@ -127,11 +160,11 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
     if not data.startswith(b"ply") or end == 0 or after < 0 or data[end:after].strip() != b"end_header":
         raise fail("it does not begin with a header from 'ply' to 'end_header'")
     elements: list[Element] = []
-    layout = texture = ""
+    layout, textures = "", []
     for number, line in enumerate(lines_of(data[:end])[1:], start=2):
         match line.split():
             case ["comment", name, _, *_] if name.lower() == "texturefile":
-                texture = line.strip()[len("comment") :].strip()[len(name) :].strip()
+                textures.append(line.strip()[len("comment") :].strip()[len(name) :].strip())
             case [] | ["obj_info" | "comment", *_]:
                 pass
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as layout, "1.0"]:
@@ -151,7 +184,7 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
     for element in elements:
         if len({p.name for p in element.properties}) < len(element.properties) or not element.properties:
             raise fail(f"its header gives {element.name!r} no properties, or one of them twice")
-    return elements, layout, texture, after + 1
+    return elements, layout, textures, after + 1
 
 
 def _columns(

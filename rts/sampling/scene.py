@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from rts.advice.bright_textures import warn_of_bright_textures
 from rts.advice.unread_entries import warn_of_unread
 from rts.advice.winding import warn_of_winding
 from rts.arrays.engines import Context, context_of_scene, is_traced
@@ -66,6 +67,7 @@ class Scene(NamedTuple):
         prepared = isinstance(parts, Prepared)
         checked, camera = check_scene(parts.parts if prepared else parts, camera)
         warn_of_unread(checked)
+        warn_of_bright_textures(checked)
         warn_of_winding(checked, camera)
         if prepared:
             fields = parts.samplers, parts.entries

@@ -859,6 +859,52 @@ def test_a_textured_ply_keeps_its_vertices_with_their_normals_and_colours(tmp_pa
     np.testing.assert_array_equal(part.theta["colors"], [(0, 1, 0)] * 5)
 
 
+def ply_of_textures(folder, names, numbers, kind="int"):
+    """A PLY of three polygons, a square and two triangles, with coordinates of their corners and textures' numbers."""
+    text = "".join(f"comment TextureFile {name}\n" for name in names)
+    for name, color in (("a.png", (255, 0, 0)), ("b.png", (0, 0, 255))):
+        Image.fromarray(np.full((2, 2, 3), color, np.uint8)).save(folder / name)
+    more = "property list uchar float texcoord\n" + (f"property {kind} texnumber\n" if numbers else "")
+    header = PLY.replace("element vertex", text + "element vertex", 1).replace("end_header", more + "end_header")
+    rows = "".join(f"{x} {y} 0\n" for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (2, 0), (2, 1)])
+    faces = ["4 0 1 2 3 8 0 0 1 0 1 1 0 1", "3 1 4 5 6 0 0 1 0 1 1", "3 1 5 2 6 .5 .5 1 1 0 1"]
+    faces = [f"{face} {number}".rstrip() for face, number in zip(faces, numbers or [""] * 3, strict=True)]
+    return write(folder / "m.ply", header.format(6, 3) + rows + "\n".join(faces) + "\n")
+
+
+@pytest.mark.parametrize("kind", ["int", "uchar", "float"])
+def test_faces_of_a_ply_have_the_textures_of_their_numbers(tmp_path, kind):
+    path = ply_of_textures(tmp_path, ["a.png", "b.png"], [1, 0, 1], kind)
+    red, blue = rts.load(path)
+    for part, color, uv in (
+        (red, (1, 0, 0), [(0, 0), (1, 0), (1, 1)]),
+        (blue, (0, 0, 1), [(0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1), (0.5, 0.5), (1, 1), (0, 1)]),
+    ):
+        np.testing.assert_array_equal(part.theta["texture"][0, 0], color)
+        table = part.surface.proxy(part.theta["vertices"], None, (1, 1)).ids[:, -3:]
+        np.testing.assert_array_equal(part.theta["uv"][table].reshape(-1, 2), uv)
+    camera = rts.Camera.orthographic((1, 0.5, 2), (1, 0.5, 0), height=1.0, far=10.0)
+    image = rts.render([red, blue], camera, (32, 64), splatter="none")
+    np.testing.assert_allclose(image[16, [10, 60], :3], [(0, 0, 1), (1, 0, 0)], atol=1e-6)
+    np.testing.assert_allclose(image[4, 36, :3], (0, 0, 1), atol=1e-6)
+    with pytest.raises(InputError, match="different textures, which cannot be merged"):
+        rts.load(path, merge=True)
+
+
+def test_faces_of_a_ply_whose_texture_is_not_told_are_warned_of(tmp_path):
+    path = ply_of_textures(tmp_path, ["a.png", "b.png"], [])
+    with pytest.warns(rts.errors.FileWarning, match="has 2 textures, and no texnumber of faces: the first, 'a.png'"):
+        [part] = rts.load(path)
+    np.testing.assert_array_equal(part.theta["texture"][0, 0], (1, 0, 0))
+    path = ply_of_textures(tmp_path, ["a.png"], [0, -1, 0])
+    with pytest.warns(
+        rts.errors.FileWarning, match="1 of 3 faces have a texnumber .* its 1 textures, such as face 1 wi"
+    ):
+        red, plain = rts.load(path)
+    assert "texture" in red.theta and len(red.surface.faces) == 3
+    assert "texture" not in plain.theta and len(plain.surface.faces) == 1
+
+
 def test_point_clouds_are_refused(tmp_path):
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "m.ply")
     with pytest.raises(InputError, match="3 points but no faces"):

@@ -637,6 +637,19 @@ def seams(vertices, faces):
 
 
 @pytest.mark.parametrize("target", ALL)
+def test_a_texture_from_0_to_255_is_warned_of_once_a_surface(target):
+    part = mesh_part(quad(), shader="textured", theta={"uv": np.zeros((4, 2), np.float32)})
+    bright, right = (np.full((2, 2, 3), top, np.float32) for top in (255, 50))
+    wrong = part.replace(theta={**part.theta, "texture": arrays(target, bright)})
+    with pytest.warns(rts.errors.InputWarning, match=r"texture'\] of part 0 goes up to 255; expected linear .* 0 to 1"):
+        rts.render(wrong, CAMERA, SIZE)
+    rts.render(wrong, CAMERA, SIZE)
+    for texture, shader in ((right, "textured"), (bright, "silhouette")):
+        theta = {**part.theta, "texture": arrays(target, texture)}
+        rts.render(mesh_part(quad(), shader=shader, theta=theta), CAMERA, SIZE)
+
+
+@pytest.mark.parametrize("target", ALL)
 @pytest.mark.parametrize("name", ["sphere", "far away", "with seams", "mirrored box", "with a hollow"])
 def test_closed_meshes_that_are_wound_inside_out_are_warned_of_once(name, target):
     vertices, faces = icosphere(2)
