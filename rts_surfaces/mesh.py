@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
+from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
 from rts.plugin_api.arrays import Array, Tree, exemplar, shape_of
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
-from rts_surfaces.smooth_normals import smooth_normals, table_of, vertex_normals
+from rts_surfaces.smooth_normals import face_normals, smooth_normals, table_of, vertex_normals, with_own_normals
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangents")
 
@@ -65,7 +65,7 @@ class Mesh(TriangleSurface):
         self._corners = None if len(self._tables) == 1 else _corners(self._tables)
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
-        self._normals: tuple[tuple, np.ndarray] | None = None
+        self._normals: tuple[tuple, np.ndarray, np.ndarray] | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -161,7 +161,7 @@ class Mesh(TriangleSurface):
         """Interpolated positions and attributes; see the class for their names."""
         vertices = with_room(theta["vertices"])
         gbuffer = GBuffer(position=self._interpolate(vertices, samples, 0))
-        gbuffer.defer("face_normal", partial(_face_normals, vertices, samples))
+        gbuffer.defer("face_normal", partial(face_normals, vertices, samples.ids))
         for name in self._attributes(theta):
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
@@ -178,20 +178,29 @@ class Mesh(TriangleSurface):
     def _smooth_normals(self, vertices: Array, samples: Samples) -> Array:
         """Normals (N, 3) at samples where θ has none."""
         if exemplar(vertices) is None:
-            return self._interpolate(self.vertex_normals(vertices), samples, 0)
+            normals, cancelled = self._vertex_normals(vertices)
+            found = self._interpolate(normals, samples, 0)
+            if not cancelled.any():
+                return found
+            return with_own_normals(found, cancelled, vertices, samples.params, samples.ids)
         return smooth_normals(vertices, samples.params, samples.ids, self.faces)
 
     def vertex_normals(self, vertices: Array) -> Array:
         """Unit normals (V, 3): directions of the area-weighted sums over the faces around each vertex, or zero.
 
-        Those of NumPy vertices are kept until the vertices change.
+        They are zero where there is no area around a vertex, or where its faces nearly cancel, as both sides of a
+        double face do; samples have the normals of their own triangles there. Those of NumPy vertices are kept until
+        the vertices change.
         """
+        return self._vertex_normals(vertices)[0]
+
+    def _vertex_normals(self, vertices: Array) -> tuple[Array, Array]:
         if exemplar(vertices) is not None:
             return vertex_normals(vertices, table_of(self.faces, vertices))
         key, kept = fingerprint(vertices), self._normals
         if kept is None or kept[0] != key:
-            kept = self._normals = (key, vertex_normals(vertices, self.faces))
-        return kept[1]
+            kept = self._normals = (key, *vertex_normals(vertices, self.faces))
+        return kept[1:]
 
 
 def _corners(tables: Sequence[np.ndarray]) -> np.ndarray:
@@ -202,10 +211,3 @@ def _corners(tables: Sequence[np.ndarray]) -> np.ndarray:
     found = numbers.astype(np.int32)
     found.flags.writeable = False  # It owns its memory, so that what is known of it is kept.
     return found
-
-
-def _face_normals(vertices: Array, samples: Samples) -> Array:
-    """Normals (N, 3) of the triangles that samples are on, of any length, as their vertices turn."""
-    xp, ids = namespace(vertices, samples.ids), samples.ids
-    origin = take(vertices, ids[:, 0])
-    return xp.linalg.cross(take(vertices, ids[:, 1]) - origin, take(vertices, ids[:, 2]) - origin)

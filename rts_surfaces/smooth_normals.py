@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -10,9 +11,15 @@ from rts import InputError, engine_of, namespace
 from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, filled_up, interpolate, take
 
+CANCELLED = 1e-3
+"""Sums over faces that are shorter than this share of what they add up are no directions; see `smooth_normals`."""
+
 
 def smooth_normals(vertices: Array, params: Array, ids: Array, faces: np.ndarray) -> Array:
     """Normals (N, 3) interpolated between those of vertices, differentiable in vertices and params.
+
+    Where the faces around a vertex nearly cancel, as both sides of a double face do, the unit normal of the sample's
+    own triangle stands for the vertex's.
 
     Args:
         vertices: (V, 3) float.
@@ -32,17 +39,36 @@ def table_of(faces: np.ndarray, vertices: Array) -> Array:
     return engine.constant(filled_up(faces, engine.room(len(faces), vertices)), vertices)
 
 
-def vertex_normals(vertices: Array, faces: Array) -> Array:
-    """Unit normals (V, 3): directions of the area-weighted sums over the faces (T, 3) around each vertex, or zero."""
+def vertex_normals(vertices: Array, faces: Array) -> tuple[Array, Array]:
+    """Unit normals (V, 3): directions of the area-weighted sums over the faces (T, 3) around each vertex, or zero.
+
+    With them (V, 1), one where a sum nearly cancels (`CANCELLED`), whose normal is zero, and zero elsewhere.
+    """
     xp, engine = namespace(vertices), engine_of(vertices)
-    a, b, c = (take(vertices, faces[:, i]) for i in range(3))
-    face_normals = xp.linalg.cross(b - a, c - a)
+    normals = face_normals(vertices, faces)
+    sizes = xp.max(abs(engine.stop_gradient(normals)), axis=1, keepdims=True)  # No squares, which may be too small.
     segments = xp.reshape(faces.T, (-1,))
-    return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))
+    rows = engine.segment_sum(xp.concat([xp.concat([normals, sizes], axis=1)] * 3), segments, vertices.shape[0])
+    sums, sizes = rows[:, :3], engine.stop_gradient(rows[:, 3:])
+    largest = xp.max(abs(engine.stop_gradient(sums)), axis=1, keepdims=True)
+    cancelled = (sizes > 0) & (largest <= CANCELLED * sizes)
+    return unit(xp.where(cancelled, 0 * sums, sums)), xp.astype(cancelled, vertices.dtype)
+
+
+def face_normals(vertices: Array, ids: Array) -> Array:
+    """Normals (N, 3) of the triangles whose vertices are the first three `ids` (N, I), twice their areas long."""
+    origin = take(vertices, ids[:, 0])
+    return namespace(vertices, ids).linalg.cross(take(vertices, ids[:, 1]) - origin, take(vertices, ids[:, 2]) - origin)
+
+
+def with_own_normals(normals: Array, cancelled: Array, vertices: Array, params: Array, ids: Array) -> Array:
+    """Normals (N, 3) at samples, with those of their own triangles for vertices that are `cancelled` (V, 1)."""
+    return normals + interpolate(cancelled, ids, 0, params) * unit(face_normals(vertices, ids))
 
 
 def _specification(vertices: Array, params: Array, ids: Array, faces: Array) -> Array:
-    return interpolate(vertex_normals(vertices, faces), ids, 0, params)
+    normals, cancelled = vertex_normals(vertices, faces)
+    return with_own_normals(interpolate(normals, ids, 0, params), cancelled, vertices, params, ids)
 
 
 def _check(vertices: np.ndarray, params: np.ndarray, ids: np.ndarray, faces: np.ndarray, **_: object) -> None:
@@ -65,7 +91,8 @@ def _shape(vertices: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ..
 def _loops() -> tuple[Callable, Callable, Callable]:
     from rts_surfaces import smooth_normals_loops as loops
 
-    return loops.forward, loops.push, loops.pull
+    forward, push, pull = (partial(f, least=CANCELLED) for f in (loops.forward, loops.push, loops.pull))
+    return forward, push, pull
 
 
 SMOOTH_NORMALS = Operation.of_loops(
