@@ -26,6 +26,7 @@ from rts.files.ply_reader import read_ply
 from rts.files.srgb import decode_srgb
 from rts.files.stl_reader import read_stl
 from rts.files.trimesh_reader import read_with_trimesh
+from rts.files.windings import Tally, wound_alike
 from rts.scene.parts import Part
 from rts.shading.pbr import Pbr
 from rts.shading.shaders import Lambert, Textured, Unlit
@@ -48,10 +49,15 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     a texture, `unlit` where a glTF says that there is no light, or `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
-    about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
-    as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
-    that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent. Heights
-    of `map_Bump` become "normal_map", and so does a picture there that has the colours of a normal map.
+    about their first corner, concave ones so that the triangles do not overlap. Faces that have the corners of
+    another one are left out, also if they go the opposite way, unless `cull` has each seen from its own side only.
+    Where the file has no normals, faces that share edges are wound alike: as the outside of what is closed is, else as
+    most of them are. A warning says how many were changed; what is wound alike with the inside out stays so.
+
+    A material of an OBJ is as opaque as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more,
+    or the comments of the MTL say that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque,
+    and `d 0` transparent. Heights of `map_Bump` become "normal_map", and so does a picture there that has the colours
+    of a normal map. Maps whose pictures are not there are left out, with a warning.
 
     Parts of a glTF are at rest: joints, morph targets, clips, lights and cameras are left out, with a warning, and
     `rts.load_model` reads them.
@@ -116,7 +122,10 @@ def parts_of(path: Path, pieces: list[Piece], merge: bool = False, weld: bool = 
     meshes = [linear(piece) for piece in meshes]
     if merge and (len(meshes) > 1 or meshes[0].transform is not None):
         meshes = [_merged(path, meshes)]
-    return [part_of(path, piece, weld).replace(cull=cull_of(piece, cull)) for piece in meshes]
+    tally = Tally()
+    parts = [part_of(path, piece, weld, cull_of(piece, cull), tally) for piece in meshes]
+    tally.warn(path)
+    return parts
 
 
 def linear(piece: Piece) -> Piece:
@@ -132,16 +141,29 @@ def linear(piece: Piece) -> Piece:
 
 
 def part_of(
-    path: Path, piece: Piece, weld: bool, surface: Callable[[np.ndarray, dict[str, Any]], Any] | None = None
+    path: Path,
+    piece: Piece,
+    weld: bool,
+    cull: str,
+    tally: Tally,
+    surface: Callable[[np.ndarray, dict[str, Any]], Any] | None = None,
 ) -> Part:
-    """The part of a piece; a mesh, or the `surface` (faces, indices of attributes) → surface."""
+    """The part of a piece; a mesh, or the `surface` (faces, indices of attributes) → surface.
+
+    `tally` is told which of its faces are left out or turned over.
+    """
     vertices, faces = piece.vertices.astype(np.float32), piece.faces
     if weld:
         rows, faces = used_rows(vertices, faces)
         vertices, place = welded_rows(rows)
         faces = place[faces]
+    attributes = piece.attributes
+    wound = wound_alike(vertices, faces, tally, both_sides=cull == "back", has_normals="normals" in attributes)
+    if wound is not None:
+        faces = wound.table(faces)
+        attributes = {name: (rows, wound.table(table)) for name, (rows, table) in attributes.items()}
     theta, indices = {"vertices": vertices}, {}
-    for name, (rows, table) in piece.attributes.items():
+    for name, (rows, table) in attributes.items():
         theta[name], indices[name] = _settled(rows.astype(np.float32), table, faces, len(vertices))
     if theta.get("colors", np.zeros((0, 0))).shape[1] == 4 and (theta["colors"][:, 3] >= 1).all():
         theta["colors"] = np.ascontiguousarray(theta["colors"][:, :3])
@@ -168,6 +190,7 @@ def part_of(
         theta,
         shader(opaque=not translucent, **piece.options),
         piece.transform,
+        cull=cull,
     )
 
 

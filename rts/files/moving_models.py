@@ -22,6 +22,7 @@ from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
 from rts.files.models import check_exists, linear, part_of, used_rows, welded_rows
 from rts.files.paths import as_path, beside
+from rts.files.windings import Tally
 from rts.scene.model import Binding, Model
 from rts.scene.parts import Part
 
@@ -59,7 +60,7 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
         scene, accessors = read_scene(gltf)
         nodes = gltf.part("its nodes", read_nodes, gltf)
         skins = read_skins(gltf, accessors, nodes)
-        parts, bindings = [], []
+        parts, bindings, tally = [], [], Tally()
         for piece, primitive, node in scene:
             if not len(piece.faces):
                 continue
@@ -68,10 +69,11 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
             name, count = f"the mesh of node {node}", None if skin is None else len(skins[skin].joints)
             deformation = gltf.part(name, read_deformation, gltf, name, primitive, accessors, count)
             is_bent = deformation is not None and deformation.joints is not None
-            parts.append(_part(path, linear(piece), deformation, weld).replace(cull=cull_of(piece, cull)))
+            parts.append(_part(path, linear(piece), deformation, weld, cull_of(piece, cull), tally))
             bindings.append(Binding(node, skin if is_bent else None))
         if not parts:
             raise InputError(f"{path} holds no faces; expected a mesh with triangles")
+        tally.warn(path)
         cameras = read_cameras(gltf)
         model = Model(
             tuple(parts),
@@ -96,10 +98,10 @@ def _skin_of(gltf: Gltf, node: int, count: int) -> int | None:
     return skin
 
 
-def _part(path: Path, piece: Piece, deformation: Deformation | None, weld: bool) -> Part:
+def _part(path: Path, piece: Piece, deformation: Deformation | None, weld: bool, cull: str, tally: Tally) -> Part:
     """The part of a piece, of the surface `skinned` if it is bent, without joint transforms and morph weights."""
     if deformation is None:
-        return part_of(path, piece, weld)
+        return part_of(path, piece, weld, cull, tally)
     count, targets = deformation.displacements.shape[:2]
     joints = np.zeros((count, 0)) if deformation.joints is None else deformation.joints
     weights = np.zeros((count, 0)) if deformation.weights is None else deformation.weights
@@ -119,7 +121,8 @@ def _part(path: Path, piece: Piece, deformation: Deformation | None, weld: bool)
         numbers = None if deformation.joints is None else joints.astype(np.int32)
         return registry.plugin("rts.surfaces", "skinned")(faces, numbers, indices)
 
-    part = part_of(path, piece._replace(vertices=vertices, faces=faces, attributes=attributes), False, surface)
+    piece = piece._replace(vertices=vertices, faces=faces, attributes=attributes)
+    part = part_of(path, piece, False, cull, tally, surface)
     theta = dict(part.theta)
     if deformation.joints is not None:
         theta["joint_weights"] = np.ascontiguousarray(weights)

@@ -13,7 +13,8 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
 
     A polygon all of whose corners are seen from its first one, such as any that is convex, becomes the fan about that
     corner. Others, which are concave, are cut as seen along the axis that their Newell normal is nearest to.
-    Polygons without area, or which cross themselves so that no triangles fit, become fans.
+    Polygons without area, or which cross themselves so that no triangles fit, become fans. A polygon around the corners
+    of an earlier one, in either direction, is cut as that one is.
 
     Args:
         points: (V, 3) float, one unit for all axes; numbers that are not finite do no harm.
@@ -47,7 +48,41 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
             forced += 1
         else:
             triangles[first[polygon] : first[polygon] + count - 2] = begin + ears
+    _cut_alike(triangles, corners, sizes)
     return triangles, owner, forced
+
+
+def _cut_alike(triangles: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> None:
+    """Cut in place polygons that go around the corners of an earlier one, in either direction, as that one is.
+
+    So the triangles on both sides of a double polygon are the same ones. Arguments are those of `cut`, and its result.
+    """
+    first = np.cumsum(sizes - 2) - (sizes - 2)
+    begins = np.cumsum(sizes) - sizes
+    for size in np.unique(sizes[sizes > 3]):
+        polygons = np.flatnonzero(sizes == size)
+        steps = np.arange(size)
+        rings = corners[begins[polygons][:, None] + steps]
+        # From the lowest corner on, towards the lower one of its neighbours.
+        start = rings.argmin(axis=1)
+        ahead, back = (np.take_along_axis(rings, (start[:, None] + way) % size, axis=1)[:, 0] for way in (1, -1))
+        way = np.where(ahead < back, 1, -1)
+        rings = np.take_along_axis(rings, (start[:, None] + way[:, None] * steps) % size, axis=1)
+        with np.errstate(over="ignore"):  # Sums that differ, as they nearly always do, are quickly found to differ.
+            sums = rings @ np.int64(0x9E3779B97F4A7C1) ** steps
+        if len(np.unique(sums)) == len(sums):
+            continue
+        _, earliest, group = np.unique(rings, axis=0, return_index=True, return_inverse=True)
+        model = earliest[group.reshape(-1)]
+        distinct = (np.diff(np.sort(rings, axis=1), axis=1) > 0).all(axis=1)
+        again = np.flatnonzero((model != np.arange(len(polygons))) & distinct)
+        of = model[again]
+        rows = np.arange(size - 2)
+        theirs = triangles[first[polygons[of]][:, None] + rows] - begins[polygons[of]][:, None, None]
+        turn = (way[again] * way[of])[:, None, None]
+        ours = (start[again][:, None, None] + turn * (theirs - start[of][:, None, None])) % size
+        ours = np.where(turn < 0, ours[:, :, ::-1], ours)
+        triangles[first[polygons[again]][:, None] + rows] = ours + begins[polygons[again]][:, None, None]
 
 
 def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes: np.ndarray) -> np.ndarray:

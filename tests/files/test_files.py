@@ -196,7 +196,8 @@ def test_an_obj_has_one_part_a_material(tmp_path):
         tmp_path / "m.mtl",
         "newmtl a\nKd 1 0.5 0\nnewmtl b\nKd 1 1 1\nd 0.25\nnewmtl unused\nmap_Kd gone.png\n",
     )
-    faces = "usemtl b\nf 1 2 3\nusemtl a\nf 1 3 4\nusemtl b\nf 1 2 4\n"
+    behind = "v 0 0 -1\nv 1 0 -1\nv 0 1 -1\n"
+    faces = behind + "usemtl b\nf 1 2 3\nusemtl a\nf 1 3 4\nusemtl b\nf 5 6 7\n"
     b, a = rts.load(write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + faces))
     assert len(b.surface.faces) == 2 and len(a.surface.faces) == 1
     np.testing.assert_allclose(a.theta["color"], [1, 0.2140411, 0], atol=1e-6)

