@@ -224,7 +224,7 @@ def matrix() -> Figure:
     made, (pixel, table) = figure(8.4, 3.4, 2)
     sampled, found, row = sampled_cards()
     stencil, owners = sampled.stencil, np.repeat((0, 1), [len(one.ids) for one in sampled.samples])
-    corner = CARD[np.argmin(CARD[:, 0] + CARD[:, 1]), :2] * (1, -1) + SIDE / 2
+    corner = CARD[2, :2] * (1, -1) + SIDE / 2
     cell = tuple((np.floor(corner).astype(int) + sampled.apron)[::-1])
     shades = ("#F2BE99", "#99C7E0")
     pixel.add_patch(Rectangle((0, 0), 1, 1, fc=shades[int(owners[row[0][cell]])], ec="none"))
@@ -249,7 +249,7 @@ def matrix() -> Figure:
     order = sorted(weights, key=lambda sample: (owners[sample], -weights[sample]))
     for place, sample in enumerate(order):
         table.barh(place, weights[sample], color=(ORANGE, BLUE)[int(owners[sample])], height=0.7)
-        name = "centre" if sample == row[0][cell] else "beside a break"
+        name = "centre" if sample == row[0][cell] else "centre nearby" if (row[0] == sample).any() else "beside a break"
         table.text(weights[sample] + 0.02, place, f"{weights[sample]:.3f}   {name}", va="center", fontsize=8)
     table.set(xlim=(0, 1.15), ylim=(len(order) - 0.4, -0.6), yticks=range(len(order)))
     table.set_yticklabels([f"sample {sample}" for sample in order], fontsize=8)
