@@ -21,6 +21,11 @@ BAND = 2**20
 APRON = 2
 """Cells sampled beyond each side of the image where no splatter tells its reach."""
 
+OUTLINES_APRON = 1
+"""How many more are sampled where outlines are found: how an outline turns within the squares of the outermost cells is
+told by the two breaks that come next along it, the second of which is two squares farther out. So a window, or a view
+beside others, shows of them what the whole image does."""
+
 
 @dataclass(frozen=True)
 class RenderSettings:
@@ -88,11 +93,13 @@ class RenderSettings:
 
     @property
     def apron(self) -> int:
-        """Number of cells sampled beyond each side of the image: the splatter's reach plus one.
+        """Number of cells sampled beyond each side of the image: the splatter's reach plus one, and `OUTLINES_APRON`.
 
         Samples within reach affect the image, and splatters may read one cell beside theirs.
         """
-        return APRON if self.splatter is None else self.splatter.reach + 1
+        if self.splatter is None:
+            return APRON
+        return self.splatter.reach + 1 + (OUTLINES_APRON if self.finds_outlines else 0)
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
         """(first row, number of rows) of each band of an image (height, width).

@@ -135,6 +135,28 @@ def test_bands_of_a_closed_surface_have_no_seams(splatter, monkeypatch):
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("opaque", [True, False])
+def test_every_window_shows_its_rectangle_of_the_image_where_outlines_turn_within_two_pixels(opaque):
+    """A polygon with corners about every 2 pixels, of which a window's border cuts some."""
+    turn = 2 * np.pi * np.arange(24) / 24
+    radius = np.random.default_rng(0).uniform(0.6, 0.9, 24)[:, None]
+    corners = np.concatenate([np.zeros((1, 3)), radius * np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)])
+    i = np.arange(24)
+    faces, rgba = (
+        np.stack([0 * i, i + 1, (i + 1) % 24 + 1], 1),
+        np.tile([1.0, 0.5, 0.2, 1.0 if opaque else 0.5], (25, 1)),
+    )
+    shader = rts.plugin("shaders", "unlit")(opaque=opaque)
+    part, size = rts.Part(MESH(faces), {"vertices": corners, "colors": rgba}, shader), (20, 20)
+    whole = rts.render(part, CAMERA, size)
+    assert whole[..., 3].max() > 0.4
+    for first in range(4, 15):
+        for rows, columns in ((slice(first, first + 2), slice(0, 20)), (slice(0, 20), slice(first, first + 2))):
+            corner, extent = (rows.start, columns.start), (rows.stop - rows.start, columns.stop - columns.start)
+            window = rts.render(part, CAMERA.window(size, corner, extent), extent)
+            np.testing.assert_allclose(window, whole[rows, columns], rtol=0, atol=1e-5)
+
+
 def test_shaders_see_the_camera_of_the_whole_image(monkeypatch):
     def where(theta, gbuffer, camera):
         xp = rts.namespace(gbuffer["position"])
