@@ -42,8 +42,10 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     size = breaks.joined.shape[1:]
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, *size)
     # By squares; in each of them clockwise, part by part if outlines may cross.
-    group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
-    order = np.argsort(group + 1j * along, kind="stable")  # By both parts, and faster than lexsort.
+    group, order = square, np.argsort(square + 1j * along, kind="stable")  # By both, and faster than lexsort.
+    if layered:
+        group = loops.groups_of(order, square, ends)
+        order = np.argsort(group + 1j * along, kind="stable")
     known = breaks.place, breaks.tangent
     of_breaks = *known, breaks.cells_away
     origin, ties, square_sides, neighbours = loops.segments_of(order, group, square, ends, *of_breaks, size[1])

@@ -100,6 +100,46 @@ def ends_of(gap, place, near, parts, height, width):
     return square[:count], along[:count], ends[:count]
 
 
+@loop
+def groups_of(order, square, ends):
+    """(E,) int64: which ends of a square may be joined where light passes through: those of one part, and crossings.
+
+    A crossing of two parts goes on as the outline of the one of which there is an odd number of ends, such as where
+    something opaque hides the rest; else crossings of two parts are joined among themselves. Groups are numbered as
+    their first ends come around a square, so that it has no effect which part comes first.
+
+    Args:
+        order: (E,) sorts ends by squares, in each clockwise.
+        square: (E,), see `ends_of`.
+        ends: (E, 5), see `ends_of`.
+    """
+    count, first = len(order), 0
+    group, kind = np.empty(count, np.int64), np.empty((count, 2), np.int32)
+    while first < count:
+        stop = first
+        while stop < count and square[order[stop]] == square[order[first]]:
+            stop += 1
+        for n in range(first, stop):
+            e = order[n]
+            kind[n, 0], kind[n, 1] = ends[e, 3], -1
+            if ends[e, 2] == 0:
+                odd_front, odd_back = False, False
+                for m in range(first, stop):
+                    if ends[order[m], 2] != 0:
+                        odd_front ^= ends[order[m], 3] == ends[e, 3]
+                        odd_back ^= ends[order[m], 3] == ends[e, 4]
+                if odd_front == odd_back:
+                    kind[n, 1] = ends[e, 4]
+                elif odd_back:
+                    kind[n, 0] = ends[e, 4]
+            m = first
+            while kind[m, 0] != kind[n, 0] or kind[m, 1] != kind[n, 1]:
+                m += 1
+            group[e] = m
+        first = stop
+    return group
+
+
 @compiled(inline="always")
 def _join(begins, ends, place, tangent, cells_away, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
@@ -142,11 +182,11 @@ def _cost(a, b, ends, place, tangent, cells_away):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
     other_front, other_back = ends[b, 3], ends[b, 4]
-    if crosses and front != other_front:  # A line of crossing goes on as the outline of either surface.
-        if ends[a, 2] == 0:
-            front, back = back, front
-        else:
-            other_front, other_back = other_back, other_front
+    # A line of crossing goes on as the outline of either surface, or where either crosses a third one.
+    if front != other_front and ends[a, 2] == 0 and (back == other_front or (back == other_back and not crosses)):
+        front, back = back, front
+    if front != other_front and ends[b, 2] == 0 and front == other_back:
+        other_front, other_back = other_back, other_front
     if front != other_front or ends[a, 2] * ends[b, 2] > 0:
         return np.inf
     p, q = ends[a, 0], ends[b, 0]

@@ -48,3 +48,32 @@ def test_the_breaks_before_and_after_a_segment_are_in_order():
     _, ties, _, around = segments_between([(y, 1, 1) for y in range(5)], places, [0] * 5)
     np.testing.assert_array_equal(ties, [(0, 1), (1, 2), (2, 3), (3, 4)])
     np.testing.assert_array_equal(around, [(-1, -1, 2, 3), (-1, 0, 3, 4), (0, 1, 4, -1), (1, 2, -1, -1)])
+
+
+OUTLINE, ENTERS, CROSSING = 1, -1, 0
+"""Kinds of ends: one where the way around a square leaves a front, one where it enters it, and one of a crossing."""
+
+
+@pytest.mark.parametrize("names", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        # Outlines of glass cross: those of each part are joined.
+        ([(OUTLINE, 0), (OUTLINE, 1), (ENTERS, 0), (ENTERS, 1)], [0, 1, 0, 1]),
+        # Something opaque hides the rest of an outline, which the line of crossing goes on as.
+        ([(OUTLINE, 0), (CROSSING, 0, 1)], [0, 0]),
+        ([(CROSSING, 0, 1), (OUTLINE, 1), (OUTLINE, 0), (ENTERS, 0)], [0, 0, 2, 2]),
+        # A line of crossing ends at an outline that goes through the square, and meets those of others anywhere.
+        ([(OUTLINE, 0), (CROSSING, 0, 1), (ENTERS, 0)], [0, 1, 0]),
+        ([(CROSSING, 0, 1), (CROSSING, 1, 2), (CROSSING, 1, 0), (CROSSING, 2, 1)], [0, 1, 0, 1]),
+    ],
+)
+def test_ends_of_glass_are_grouped_alike_whichever_part_comes_first(names, kinds, expected):
+    ends = np.zeros((len(kinds), 5), np.int32)
+    for e, (kind, *parts) in enumerate(kinds):
+        front, back = names[parts[0]], names[parts[1]] if len(parts) > 1 else -1
+        if kind == CROSSING:
+            front, back = min(front, back), max(front, back)
+        ends[e] = e, e % 4, kind, front, back
+    square, order = np.full(len(kinds), 7), np.arange(len(kinds))
+    assert loops.groups_of(order, square, ends).tolist() == expected

@@ -123,3 +123,18 @@ def test_colours_of_heaps_of_cards_stay_in_range(seed):
         parts.append(card(vertices, random.random(3)))
     image = rts.render(parts, in_pixels(), SIZE)
     assert image.min() >= -1e-5 and image.max() <= 1 + 1e-5
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_surfaces_that_pass_through_one_another_give_one_image_in_any_order(opaque):
+    """Large triangles at random, each a part of its own, of which most cross others."""
+    corners = np.random.default_rng(4).normal(size=(6, 3, 3)) * [8, 8, 2] + [12, 12, 8]
+    shader, mesh = rts.plugin("shaders", "unlit")(opaque=opaque), rts.plugin("surfaces", "mesh")(np.array([(0, 1, 2)]))
+    parts = []
+    for n, vertices in enumerate(corners * [1, 1, -1]):
+        colors = np.tile([n / 5, 1 - n / 5, 0.5, 1.0 if opaque else 0.6], (3, 1))
+        parts.append(rts.Part(mesh, {"vertices": vertices, "colors": colors}, shader))
+    image = rts.render(parts, in_pixels(), SIZE)
+    assert (rts.sample(parts, in_pixels(), SIZE).outlines.near == 2).sum() > 10
+    for order in ([5, 4, 3, 2, 1, 0], [2, 0, 4, 5, 1, 3]):
+        np.testing.assert_allclose(rts.render([parts[i] for i in order], in_pixels(), SIZE), image, rtol=0, atol=1e-6)
