@@ -203,14 +203,18 @@ def _next_ending(stack, count, own, of, place):
 
 
 @compiled(inline="always")
-def _next_starting(i, n, own, of, place):
-    """The first run from the span i on that starts at a place, and is not in the stack yet; n if there is none."""
-    while i < n:
+def _next_starting(n, own, of, place, until):
+    """The nearest run that starts at a place, and is not in the stack yet; n if there is none.
+
+    Of several, such as of parts that have an edge in common, that is: whichever part comes first.
+    """
+    found = n
+    for i in range(n):
         waits = of[i, LIVE] == 1 and of[i, INSIDE] == 0 and of[i, BEFORE] < 0
         if waits and own[i, LOW] <= place < own[i, HIGH]:
-            break
-        i += 1
-    return i
+            if found == n or _before(own, i, found, place, min(until, own[i, HIGH], own[found, HIGH])):
+                found = i
+    return found
 
 
 @compiled(inline="always")
@@ -378,7 +382,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                     _remove(stack, count, x)
                     count -= 1
             m = _next_ending(stack, count, own, of, place)
-        farther, i = _next_knot(knots, k, known), _next_starting(0, n, own, of, place)
+        farther = _next_knot(knots, k, known)
+        i = _next_starting(n, own, of, place, farther)
         while i < n:
             low, partner = own[i, LOW], -1
             m = _insert(stack, count, i, own, low, min(farther, own[i, HIGH]))
@@ -393,7 +398,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                     change = base, found, 1, m, partner, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
-            i = _next_starting(i + 1, n, own, of, place)
+            i = _next_starting(n, own, of, place, farther)
     return found
 
 
