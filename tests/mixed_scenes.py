@@ -7,6 +7,10 @@ from helpers import rigid
 
 import rts
 
+AWKWARD = 10_000
+"""From this number on, half of the cameras are among the parts, half of the parts that let light through have vertices
+with an alpha of exactly 1, and half of the scenes have a part that begins at an edge of another one."""
+
 UNLIT = rts.plugin("shaders", "unlit")
 MESH = rts.plugin("surfaces", "mesh")
 
@@ -37,7 +41,7 @@ class Mixed(NamedTuple):
 
 
 def mixed_of(number):
-    """The scene of a number. Every fourth is opaque; of every ten two are of one to four triangles."""
+    """The scene of a number. Every fourth is opaque; of every ten two are of few triangles. See `AWKWARD`."""
     rng = np.random.default_rng(number)
     small = number % 5 == 0
     size = tuple(int(n) for n in np.round(5 * 8 ** rng.random(2)))
@@ -46,7 +50,41 @@ def mixed_of(number):
     cameras = [_camera(rng, size) for _ in range(2)]
     layers = [2, 3, 2, 3, 1, 4, "auto", 6][rng.integers(8)]
     supersample = [1, 1, 1, 2, 2, 2, 3][rng.integers(7)]
-    return Mixed(parts, cameras, size, layers, supersample, rng.random() < 0.3)
+    poses = rng.random() < 0.3
+    if number >= AWKWARD:
+        parts, cameras = _awkward(rng, parts, cameras, size)
+    return Mixed(parts, cameras, size, layers, supersample, poses)
+
+
+def _awkward(rng, parts, cameras, size):
+    """The parts and cameras of a scene, made awkward; see `AWKWARD`."""
+    for part in parts:
+        if not part.shader.opaque and rng.random() < 0.5:
+            alpha = part.theta["colors"][:, 3]
+            alpha[rng.random(len(alpha)) < rng.choice([0.5, 1.0])] = 1.0
+    if rng.random() < 0.5:
+        parts = [*parts, _neighbour(rng, parts[-1])]
+    inside = [rng.random() < 0.5 for _ in cameras]
+    cameras = [_inner_camera(rng, size) if within else c for within, c in zip(inside, cameras, strict=True)]
+    return parts, cameras
+
+
+def _neighbour(rng, part):
+    """A triangle that shares an edge with the first one of a part."""
+    vertices = part.theta["vertices"][part.surface.faces[0]]
+    vertices[2] = rng.uniform(-1, 1, 3)
+    theta = {
+        "vertices": vertices,
+        "colors": rng.random((3, 4)) * [1, 1, 1, 0] + part.theta["colors"][:3] * [0, 0, 0, 1],
+    }
+    return part.replace(surface=MESH(np.array([(0, 1, 2)], np.int32)), theta=theta)
+
+
+def _inner_camera(rng, size):
+    """A camera among the parts, which may cut some of them with its near plane."""
+    options = {"aspect": size[1] / size[0], "near": 0.1, "far": 20.0}
+    eye = 0.5 * rng.normal(size=3)
+    return rts.Camera.look_at(eye, eye + rng.normal(size=3), rng.normal(size=3), fov_y=rng.uniform(40, 90), **options)
 
 
 def _opaque(rng, count, number):

@@ -19,28 +19,48 @@ from mixed_scenes import mixed_of
 import rts
 from rts.arrays.trees import leaves, map_leaves
 from rts.compiling import threads
+from rts.rendering.settings import RenderSettings
 from rts.splatting.edges import splatter as edges
 from rts.splatting.edges import stack_sides
 from rts.splatting.edges import stacks as edges_stacks
 
-FLAGS = ("threads", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
+SAMPLERS = ("embree", "reference")
+"""Names of samplers, in place of "raster"."""
+
+FLAGS = (
+    *("threads", "views", "prepared", "enough", "bands", "shuffled", "found", *SAMPLERS),
+    *("specified", "forward", "numpy", "jax", "jit"),
+)
 """How a way differs from `rts.render` of torch arrays, and a gradient in reverse mode.
 
 - threads: on four threads, however little work there is.
 - views: `rts.render_views` of both cameras, in place of one call each.
 - prepared: by `rts.prepare`.
 - enough: with the least capacity that drops nothing.
+- bands: in bands of two rows.
+- shuffled: the parts in the reverse order.
+- found: with `layers="auto"`, compared with `LAYERS`, which is enough.
+- embree, reference: by this sampler.
 - specified: by the splatter in array code.
 - forward: a derivative in forward mode.
 - numpy, jax, jit: arrays of NumPy, of jax, and of jax in a compiled program.
 """
 
-NEVER = ({"numpy", "jax"}, {"numpy", "jit"}, {"jax", "jit"}, {"numpy", "forward"})
-TOO_LONG = ({"specified", "jax"}, {"specified", "jit"})
+NEVER = ({"numpy", "jax"}, {"numpy", "jit"}, {"jax", "jit"}, {"numpy", "forward"}, {"prepared", "shuffled"})
+TOO_LONG = ({"specified", "jax"}, {"specified", "jit"}, {"bands", "jax"}, {"bands", "jit"})
 """Pairs that make no sense, and those that XLA compiles for minutes."""
+ALONE = {*SAMPLERS, "found"}
+"""Ways that are tried without others."""
 
 SINGLES = [frozenset([flag]) for flag in FLAGS]
-PAIRS = [frozenset(pair) for pair in itertools.combinations(FLAGS, 2) if set(pair) not in NEVER + TOO_LONG]
+PAIRS = [
+    frozenset(pair)
+    for pair in itertools.combinations([flag for flag in FLAGS if flag not in ALONE], 2)
+    if set(pair) not in NEVER + TOO_LONG
+]
+LAYERS = 16
+"""More layers than the scenes have."""
+
 MOST = 1e-5
 """The largest difference of images, and of derivatives as a share of the largest, in float64."""
 
@@ -82,6 +102,8 @@ def _plain(number, both, layers):
 
 def _layers(scene, way):
     """The number of layers, which has to be known in compiled programs."""
+    if "found" in way:
+        return LAYERS
     return 6 if "jit" in way and scene.layers == "auto" else scene.layers
 
 
@@ -97,7 +119,9 @@ def result_of(scene, way, view=0):
     engine = "numpy" if "numpy" in way else "jax" if {"jax", "jit"} & way else "torch-cpu"
     compiled = __import__("jax").jit if "jit" in way else lambda f: f
     weights = np.random.default_rng(0).normal(size=(2, *scene.size, 4))[view : view + len(cameras)]
-    options = {"layers": _layers(scene, way), "supersample": scene.supersample}
+    layers = "auto" if "found" in way else _layers(scene, way)
+    options = {"layers": layers, "supersample": scene.supersample}
+    options["sampler"] = next((name for name in SAMPLERS if name in way), "auto")
     with _float64(engine), _patched(way), warnings.catch_warnings():
         for kind in IGNORED:
             warnings.simplefilter("ignore", kind)
@@ -109,7 +133,8 @@ def result_of(scene, way, view=0):
         prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still)) if "prepared" in way else None
 
         def images(values):
-            return _images(_parts(scene, values, prepared), cameras, scene.size, way, options)
+            parts = _parts(scene, values, prepared)
+            return _images(parts[::-1] if "shuffled" in way else parts, cameras, scene.size, way, options)
 
         if engine == "numpy":
             return images(still), None
@@ -182,11 +207,19 @@ def _patched(way):
         if "threads" in way:
             patch.setenv("RTS_NUM_THREADS", "4")
             patch.setattr(threads, "LITTLE_WORK", 1)
+        if "bands" in way:
+            patch.setattr(RenderSettings, "bands", _thin_bands)
         if "specified" in way:
             patch.setattr(edges, "EDGES", edges.specification)
             patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
             patch.setattr(stack_sides, "SIDES", stack_sides._specification)
         yield
+
+
+def _thin_bands(_, size):
+    """The result of `RenderSettings.bands`, of two rows each; the last may have three."""
+    tops = [*range(0, max(size[0] - 1, 1), 2), size[0]]
+    return [(top, end - top) for top, end in itertools.pairwise(tops)]
 
 
 def _flat(tree):
@@ -230,15 +263,17 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("numbers", help="such as 0:500")
     parser.add_argument("--jax", type=int, default=5, help="jax at every so many numbers")
+    parser.add_argument("--ways", help="names of single ways alone, such as bands,shuffled")
     parser.add_argument("--seconds", type=float, default=np.inf, help="stop after so many")
     given = parser.parse_args()
     first, last = map(int, given.numbers.split(":"))
+    ways = given.ways and [frozenset([name]) for name in given.ways.split(",")]
     began, number = time.monotonic(), first
     tried, found, worst = collections.Counter(), collections.defaultdict(set), collections.defaultdict(float)
     for number in range(first, last):
         scene = mixed_of(number)
         kind = "translucent" if scene.translucent else "opaque"
-        for way in ways_of(number, given.jax):
+        for way in ways_of(number, given.jax) if ways is None else ways:
             tried[kind, name_of(way)] += 1
             for what, off in _differences_or_error(number, way):
                 key = kind, name_of(way), what
