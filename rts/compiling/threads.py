@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import itertools
 import os
 import sys
@@ -19,11 +20,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rts.errors import InputError
+
 TASKS_PER_THREAD = 4
 """Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
 """Nanoseconds of work for which one more thread is woken, which takes tens of thousands, and the interpreter lock."""
+
+THREADS_PER_CORE = 4
+"""Most threads for each of the machine's cores, however many are asked for: further ones would only take memory."""
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -181,14 +187,31 @@ if sys.platform != "win32":
 
 
 def thread_count() -> int:
-    """Number of threads to use: RTS_NUM_THREADS of the environment, if it is a whole number above 0.
+    """Number of threads to use: RTS_NUM_THREADS of the environment, or THREADS_PER_CORE for each core if that is less.
 
-    Otherwise the number of cores that this thread may run on (Linux), or of all cores (other systems).
+    If that is not set, or empty: the number of cores that this thread may run on (Linux), or of all cores (elsewhere).
+
+    Raises:
+        InputError: RTS_NUM_THREADS is no positive integer.
     """
-    wanted = os.environ.get("RTS_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
+    if wanted := os.environ.get("RTS_NUM_THREADS"):
+        return _limited(wanted)
     return len(cores()) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+@functools.cache
+def _limited(wanted: str) -> int:
+    """The number of threads that RTS_NUM_THREADS asks for, limited."""
+    try:
+        count = int(wanted)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise InputError(
+            f"the environment variable RTS_NUM_THREADS is {wanted[:40]!r}; expected a positive integer, such as 4; "
+            "unset it for one thread on each core"
+        )
+    return min(count, THREADS_PER_CORE * (os.cpu_count() or 1))
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from rts.compiling.threads import thread_count
 from rts.contracts.checks import check_size, check_splatter, is_auto
 from rts.contracts.splatter import Splatter
 from rts.outlines.found import Told
@@ -60,8 +61,9 @@ class RenderSettings:
             capacity: as in `rts.render`.
 
         Raises:
-            InputError: an argument is of another kind, or makes no image.
+            InputError: an argument is of another kind, or makes no image; or RTS_NUM_THREADS is no positive integer.
         """
+        thread_count()  # Refused here, before anything is sampled.
         size = check_size(size, layers, capacity, supersample)
         layers = layers if is_auto(layers) else int(layers)
         return size, cls(check_splatter(splatter), layers, int(supersample), capacity)

@@ -169,6 +169,31 @@ def test_only_as_many_threads_are_asked_as_there_is_work_for(monkeypatch, helper
     assert len(asked) == 1  # The caller's thread has the other range.
 
 
+@pytest.mark.parametrize("wanted", ["²", "0", "-1", "1.5", "two", " ", "9" * 5000])
+def test_a_wrong_number_of_threads_is_refused_before_work_starts(monkeypatch, wanted):
+    def sample(*_, **__):
+        raise AssertionError("work has begun")
+
+    monkeypatch.setattr(rts.plugin("samplers", "reference"), "sample", sample)
+    monkeypatch.setenv("RTS_NUM_THREADS", wanted)
+    with pytest.raises(rts.InputError, match="RTS_NUM_THREADS is '.{1,40}'; expected a positive integer, such as 4"):
+        rts.render(scene("reference", 0), CAMERA, (4, 5), sampler="reference")
+    with pytest.raises(rts.InputError, match="RTS_NUM_THREADS is"):
+        rts.warmup()
+
+
+def test_few_threads_a_core_are_used_of_many(monkeypatch):
+    from rts.compiling import threads
+
+    most = threads.THREADS_PER_CORE * (os.cpu_count() or 1)
+    for wanted, count in (("1", 1), (" 3 ", min(3, most)), (str(most), most), (str(most + 1), most), ("100000", most)):
+        monkeypatch.setenv("RTS_NUM_THREADS", wanted)
+        assert threads.thread_count() == count
+    for unset in (lambda: monkeypatch.setenv("RTS_NUM_THREADS", ""), lambda: monkeypatch.delenv("RTS_NUM_THREADS")):
+        unset()
+        assert threads.thread_count() == (len(threads.cores()) if sys.platform == "linux" else os.cpu_count())
+
+
 def cores_of_helper(monkeypatch, run):
     """The core of the caller of `run`, given a function of a range, and the cores on which its helper may run."""
     from rts.compiling import threads
