@@ -15,7 +15,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numba
+from rts.compiling.uninterrupted import uninterrupted
+
+
+def _numba() -> Any:
+    """numba, imported, and what it makes for the first function: a target of LLVM."""
+    import numba
+
+    numba.njit(lambda: None)
+    return numba
+
+
+numba = uninterrupted(_numba)
 
 try:
     from rts.compiling.numba_internals import kept

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from rts.compiling.loops import loop
 from rts.compiling.threads import parallel, read_only
+
+# isort: split
+import numba  # After `loops`, which imports it where no signal interrupts.
 
 SWEEPS = 12
 """Largest number of sweeps. Convergence is quadratic and takes fewer."""

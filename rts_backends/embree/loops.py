@@ -8,18 +8,22 @@ those of the rasterizer, an edge between triangles is hit once, and coplanar lay
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numba
 import numpy as np
-from llvmlite import ir
-from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
-from numba.extending import intrinsic
 
 from rts.plugin_api.loops import compiled, loop
 from rts_backends.embree.enlarged_triangles import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
+
+# isort: split
+import numba  # After `loops`, which imports it where no signal interrupts.
+from llvmlite import ir
+from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
+from numba.extending import intrinsic
 
 TILE = 8
 ACCEPT, REJECT = -1, 0
@@ -134,7 +138,6 @@ def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
     return True
 
 
-@numba.cfunc(types.void(types.CPointer(types.intp)), cache=True)
 def _keep_nearest(arguments):
     """Insert a candidate among a ray's nearest hits: Embree's intersection filter.
 
@@ -183,9 +186,16 @@ def _keep_nearest(arguments):
         ray[8] = depths[layers - 1] - state[START] + state[REACH_SLACK]
 
 
+@functools.cache
+def _compiled_filter() -> Any:
+    """The intersection filter, compiled in another thread: Ctrl-C in this one would leave the compiler locked."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(numba.cfunc(types.void(types.CPointer(types.intp)), cache=True), _keep_nearest).result()
+
+
 def keep_nearest_address() -> int:
-    """Address of the intersection filter, for Embree to call."""
-    return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
+    """Address of the intersection filter, for Embree to call; compiled at the first call."""
+    return _compiled_filter().address
 
 
 @loop

@@ -221,6 +221,49 @@ def test_loops_are_written_by_one_process_at_a_time(tmp_path):
     assert len(list(kept.glob("several.double*.nbc"))) == 2 and len(list(kept.glob("several.double*.nbi"))) == 1
 
 
+@pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
+def test_a_process_that_waits_long_for_the_lock_says_so_once_and_compiles(tmp_path, monkeypatch, capsys):
+    (tmp_path / "several.py").write_text(DOUBLE)
+    kept, *counts = called(tmp_path)
+    assert counts == [0, 2]
+    monkeypatch.setattr(compiling, "LOCK_SECONDS", 0.1)
+    monkeypatch.setattr(compiling, "_left", set())
+    with open(Path(kept) / ".lock", "ab") as file:
+        compiling.fcntl.flock(file, compiling.fcntl.LOCK_EX)
+        for _ in range(2):
+            assert called(tmp_path) == (kept, 0, 2)
+    line = f"rts: another process holds the lock of compiled loops in {kept}; compiling without them …\n"
+    assert capsys.readouterr().err == line
+    monkeypatch.setattr(compiling, "_left", set())
+    assert called(tmp_path) == (kept, 2, 0) and not capsys.readouterr().err
+
+
+@pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
+def test_the_lock_is_not_held_where_others_are_awaited(tmp_path, monkeypatch):
+    """While code is made from bytes, and bytes from code, which waits for LLVM's lock."""
+    free = []
+
+    def watched(name):
+        whole = getattr(compiling._Checked, name)
+
+        def call(*args):
+            with open(Path(folder) / ".lock", "ab") as file:
+                compiling.fcntl.flock(file, compiling.fcntl.LOCK_EX | compiling.fcntl.LOCK_NB)  # Raises if it is held.
+            free.append(name)
+            return whole(*args)
+
+        return call
+
+    (tmp_path / "several.py").write_text(DOUBLE)
+    folder = called(tmp_path)[0]
+    for path in Path(folder).glob("several*"):
+        path.unlink()
+    for name in ("reduce", "rebuild"):
+        monkeypatch.setattr(compiling._Checked, name, watched(name))
+    assert called(tmp_path)[1:] == (0, 2) and called(tmp_path)[1:] == (2, 0)
+    assert free == ["reduce"] * 2 + ["rebuild"] * 2
+
+
 DAMAGES = {
     "a bit of the code": (
         ".nbc",
@@ -305,8 +348,13 @@ print(sum(several.double.stats.cache_hits.values()), "rts.compiling.numba_intern
             "lambda f: type('Other', (), {'__slots__': ()})()",
             True,
         ),
+        (
+            "njit = numba.njit\nnumba.njit = lambda **o: njit(**o) if 'cache' in o else "
+            "lambda f: type('Other', (), {'_cache': None})()",
+            True,
+        ),
     ],
-    ids=["as it is", "no FunctionCache", "no cache of dispatchers"],
+    ids=["as it is", "no FunctionCache", "no cache of dispatchers", "another way to compile"],
 )
 @pytest.mark.thorough
 def test_loops_are_kept_by_a_numba_without_private_names(change, private, tmp_path):
