@@ -22,7 +22,7 @@ def _numba() -> Any:
     """numba, imported, and what it makes for the first function: a target of LLVM."""
     import numba
 
-    numba.njit(lambda: None)
+    numba.njit()(lambda: None)
     return numba
 
 

@@ -19,7 +19,7 @@ from rts.compiling.uninterrupted import uninterrupted
 pytestmark = pytest.mark.core
 
 ROOT = Path(__file__).resolve().parents[2]
-LONG = 900
+LONG = 1800
 """Seconds that a process may take which takes a minute on two idle cores: a hang lasts for ever."""
 
 needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="no process there can send itself Ctrl-C alone")
