@@ -77,7 +77,14 @@ class Sheets(NamedTuple):
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=4 * len(seen))
         every, sides = proxies or [proxy], np.zeros(len(faces) + 1, np.int8)
-        tables = [x.faces if x.corners is None or not seams else x.corners for x in every]
+        if seams:
+            tables = [x.faces if x.corners is None else x.corners for x in every]
+        else:  # Of one colour triangles that meet are one sheet, whether they share their vertices or not.
+            tables = [_welded(x.vertices, x.faces) for x in every]
+            if any(table is not x.faces for table, x in zip(tables, every, strict=True)):
+                shifts = np.cumsum([0, *(len(x.vertices) for x in every)], dtype=np.int32)
+                moved = [table + shift for table, shift in zip(tables, shifts, strict=False)]
+                faces = read_only(tables[0] if len(moved) == 1 else np.concatenate(moved), np.int32)
         starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
         beyond = [_beyond(table) for table in tables]
         if proxies is not None:
@@ -155,6 +162,46 @@ class Sheets(NamedTuple):
         own, mesh = (np.int32(self.parts.start), np.int32(self.parts.stop)), (self.rows, self.vertices, self.faces)
         arguments = near, parts, triangles, points, own, *mesh, slope, depth, tangent
         parallel(silhouettes_loops.edges, len(near), *arguments, work=100 * len(near))
+
+
+_welds: dict[int, tuple[weakref.ref, np.ndarray, np.ndarray]] = {}
+
+
+def _welded(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces (T, 3) int32 with one number for all vertices in one place; `faces` itself where most are shared.
+
+    Otherwise each edge of a triangle is looked at as an outline. That of a read-only table that owns its memory is
+    kept, as long as vertices that were in one place still are.
+    """
+    if len(vertices) < len(faces):  # Closed meshes have half as many vertices as triangles.
+        return faces
+    kept, key = not faces.flags.writeable and faces.flags.owndata, id(faces)
+    if kept and key in _welds and _welds[key][0]() is faces:
+        _, first, found = _welds[key]
+        if len(first) == len(vertices) and np.array_equal(vertices, vertices.take(first, 0)):
+            return found
+    first = _first_in_place(vertices)
+    if (first == np.arange(len(first))).all():
+        return faces
+    found = first[faces]
+    found.flags.writeable = False
+    if kept:
+        _welds[key] = weakref.ref(faces, lambda _: _welds.pop(key, None)), first, found
+    return found
+
+
+def _first_in_place(vertices: np.ndarray) -> np.ndarray:
+    """For each of the vertices (V, 3) a vertex in the same place (V,) int32, the same one for most of those there."""
+    bits = (vertices.astype(np.float32) + np.float32(0)).view(np.uint32).astype(np.uint64)  # −0 becomes 0.
+    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    key = (bits * factors).sum(axis=1, dtype=np.uint64)  # Wraps around.
+    order = np.argsort(key, kind="stable")
+    ordered = vertices[order]
+    new = np.ones(len(order), bool)  # Places of one key are mixed up too rarely to matter; they are then not welded.
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    first = np.empty(len(order), np.int32)
+    first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
+    return first
 
 
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}

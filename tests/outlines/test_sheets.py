@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from helpers import icosphere
 
+import rts
 from rts.compiling.threads import read_only
 from rts.contracts.records import Proxy
 from rts.outlines import sheets, spans_loops
@@ -41,6 +43,57 @@ def test_neighbours_are_kept_for_faces_that_nobody_writes_alone():
     assert sheets._beyond(free)[0, 2] == 1
     free[1] = (1, 4, 3)
     np.testing.assert_array_equal(sheets._beyond(free), np.full((2, 3), -1))
+
+
+def apart(vertices, faces):
+    """The triangles with vertices of their own."""
+    return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)
+
+
+def test_triangles_that_meet_are_neighbours_where_colours_do_not_tell():
+    vertices, faces = icosphere(1)
+    proxy, size = Proxy(*apart(vertices.astype(np.float32), faces)), (8, 8)
+    np.testing.assert_array_equal(Sheets.of(proxy, CAMERA, size, "none").beyond, sheets._beyond(faces))
+    assert (Sheets.of(proxy, CAMERA, size, "none", seams=True).beyond == -1).all()
+    # A triangle that is moved away has no neighbours, though the others were known before; zeros have no sign.
+    moved = proxy.vertices.copy()
+    moved[:3] += 1
+    moved[moved == 0] = -0.0
+    beyond = Sheets.of(proxy._replace(vertices=moved), CAMERA, size, "none").beyond
+    assert (beyond[0] == -1).all() and (beyond == -1).sum() == 6
+
+
+def test_welds_are_kept_for_faces_that_nobody_writes_while_they_hold():
+    vertices, faces = apart(*icosphere(0))
+    faces = faces.copy()
+    faces.flags.writeable = False
+    found = sheets._welded(vertices, faces)
+    assert found is not faces and sheets._welded(vertices + 1, faces) is found
+    vertices[0] += 1
+    assert len(np.unique(sheets._welded(vertices, faces))) == len(np.unique(found)) + 1
+    scattered = np.random.default_rng(0).normal(size=vertices.shape)
+    assert sheets._welded(scattered, faces) is faces
+    shared, own = icosphere(1)
+    assert sheets._welded(shared, own) is own
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_silhouettes_do_not_depend_on_which_vertices_are_shared(parts):
+    """Image and gradient are those of the mesh whose triangles share vertices, of one part and of joint ones."""
+    torch = pytest.importorskip("torch")
+    (vertices, faces), camera, size = icosphere(1), Camera.look_at((1, 2, 3), (0, 0, 0)), (24, 24)
+    soup, own = apart(np.arange(len(vertices))[:, None] * [1, 0, 0], faces)
+    weights = torch.from_numpy(np.random.default_rng(1).normal(size=(*size, 4)))
+
+    def shown(table, rows):
+        x = torch.from_numpy(vertices.copy()).requires_grad_()
+        moved = [{"vertices": (x + 0.7 * i)[rows]} for i in range(parts)]
+        image = rts.render([rts.Part(rts.Mesh(table), theta, "silhouette") for theta in moved], camera, size)
+        (image * weights).sum().backward()
+        return image.detach().numpy(), x.grad.numpy()
+
+    for shared, split in zip(shown(faces, slice(None)), shown(own, soup[:, 0]), strict=True):
+        np.testing.assert_allclose(split, shared, atol=1e-6 * np.abs(shared).max())
 
 
 @pytest.mark.parametrize(("wide", "side"), [(0.4, 1), (0.9, 2), (1.6, 3), (9.0, 3)])
