@@ -39,7 +39,8 @@ from rts.scene.transforms import (
 )
 
 NEAR_OVER_DISTANCE = 1e-2
-FAR_OVER_DISTANCE = 1e2
+FAR_OVER_DISTANCE = 1e6
+"""So far that a floor seems to reach the horizon: nothing is lost by it, as no sampler rounds depths between planes."""
 
 
 @record(static=("aspect",))
@@ -155,7 +156,7 @@ class Camera(CameraConverters):
             fov_y: vertical field of view, degrees.
             aspect: width over height of the image; None for the ratio of the rendered size.
             near: depth of the near plane; default 1/100 of the distance to the target.
-            far: depth of the far plane; default 100 times the distance to the target.
+            far: depth of the far plane; default a million times the distance to the target.
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
@@ -163,7 +164,7 @@ class Camera(CameraConverters):
                 order, or an argument has another shape or is not finite.
 
         Warns:
-            InputWarning: a field of view below 2, likely to be in radians.
+            InputWarning: a field of view that is likely to be in radians: from 0.3 to 2, or that of whole degrees.
         """
         view = look_at(eye, target, up)
         if near is None or far is None:
@@ -184,7 +185,7 @@ class Camera(CameraConverters):
         view: Any = None,
         aspect: Any = None,
         near: Any = 0.01,
-        far: Any = 1000.0,
+        far: Any = 1e6,
         principal_point: Any = (0.0, 0.0),
     ) -> Camera:
         """A perspective camera whose pose is a matrix; without one it is at the origin and looks along −z, +y up.
@@ -204,7 +205,7 @@ class Camera(CameraConverters):
                 another shape or is not finite.
 
         Warns:
-            InputWarning: a field of view below 2, likely to be in radians.
+            InputWarning: a field of view that is likely to be in radians: from 0.3 to 2, or that of whole degrees.
         """
         value = None if view is None else check_numbers("view", view, (4, 4))
         if value is not None and not (is_affine(value) and is_invertible(value[:3, :3])):

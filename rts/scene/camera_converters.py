@@ -58,7 +58,7 @@ class CameraConverters:
         size: tuple[int, int],
         *,
         near: Any = 0.01,
-        far: Any = 1000.0,
+        far: Any = 1e6,
         pixel_center: float = 0.0,
     ) -> Self:
         """A camera from OpenCV's x = K (R X + t): camera axes x right, y down, z forward.
@@ -74,8 +74,8 @@ class CameraConverters:
                 whose principal point is exactly (width / 2, height / 2).
 
         Raises:
-            InputError: K is no matrix of intrinsics, R no rotation, planes are out of order, or `t` or `size` is
-                wrong.
+            InputError: K is no matrix of intrinsics, or in units of the image, not in pixels; R is no rotation, planes
+                are out of order, or `t` or `size` is wrong.
         """
         check_planes(near, far, positive=True)
         _check_intrinsics(K)
@@ -83,6 +83,7 @@ class CameraConverters:
         check_numbers("t", t, (3,), (3, 1))
         check_numbers("pixel_center", pixel_center, ())
         height, width = check_pixels(size)
+        _check_in_pixels(K, (height, width))
         xp, (K, R, t, near, far) = promote(K, R, t, near, far)
         view = scaled_rows(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
         cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
@@ -186,7 +187,7 @@ class CameraConverters:
         principal_point: Any = (0.0, 0.0),
         size: tuple[int, int],
         near: Any = 0.01,
-        far: Any = 1000.0,
+        far: Any = 1e6,
     ) -> Self:
         """A camera from PyTorch3D's `PerspectiveCameras` in NDC, whose x is left, y up and z forward.
 
@@ -231,7 +232,7 @@ class CameraConverters:
     @classmethod
     @uncompiled
     def from_blender(
-        cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1000.0
+        cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1e6
     ) -> Self:
         """A camera from the camera-to-world matrix of Blender and of NeRF's data sets; their camera axes are ours.
 
@@ -356,4 +357,23 @@ def _check_intrinsics(K: Any) -> None:
         raise InputError(
             f"K is {value.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, with positive fx and "
             f"fy"
+        )
+
+
+NORMALISED = 0.1
+"""Focal lengths below this share of the image, with a principal point in the first pixels, are not in pixels."""
+
+
+def _check_in_pixels(K: Any, size: tuple[int, int]) -> None:
+    """Refuse known intrinsics that seem to be in units of the image, whose width and height are 1."""
+    value, (height, width) = value_of(K), size
+    if value is None or value.shape != (3, 3):
+        return
+    point, focal = value[:2, 2], (value[0, 0] / width, value[1, 1] / height)
+    if max(focal) < NORMALISED and (point >= 0).all() and (point <= 2).all():
+        raise InputError(
+            f"K looks normalised, in units of the image: fx = {value[0, 0]:.4g}, fy = {value[1, 1]:.4g}, cx = "
+            f"{point[0]:.4g}, cy = {point[1]:.4g} for an image of {width} x {height} pixels; expected pixels: multiply "
+            f"its first row by the width and its second by the height, np.diag([{width}, {height}, 1]) @ K, with "
+            f"pixel_center=0.5"
         )

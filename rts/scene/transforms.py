@@ -159,14 +159,20 @@ PARALLEL = 1e-12
 """Largest slope of clip w, relative to the slopes of clip x and y, of a projection with parallel rays."""
 ROUNDING = 1e-5
 """Rounding allowed in matrix entries that should be zero or one."""
-RADIANS = 2.0
-"""A field of view below this limit is probably in radians."""
+RADIANS = 0.3, 2.0
+"""A field of view between these limits is probably in radians: 17 to 115 degrees, those of most pictures."""
+LEAST_ROUND = 5
+"""A smaller field of view is probably in radians if in radians it is a whole number of degrees, at least so many."""
 
 
 def warn_of_radians(fov_y: Any) -> None:
-    """Warn of a known field of view that is probably in radians."""
+    """Warn of a known field of view that is probably in radians. Narrower ones are those of telephoto lenses."""
     value = value_of(fov_y)
-    if value is not None and (value < RADIANS).all():
+    if value is None:
+        return
+    degrees = np.rad2deg(np.asarray(value, np.float64))
+    is_round = (degrees > LEAST_ROUND - 0.5) & (np.abs(degrees - np.round(degrees)) < 1e-3)
+    if ((value < RADIANS[1]) & ((value >= RADIANS[0]) | is_round)).all():
         warn(
             f"fov_y is {quoted(fov_y)}, and is in degrees: of radians give math.degrees(fov_y); a telephoto lens is "
             f"seen as it is",

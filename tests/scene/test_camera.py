@@ -22,6 +22,7 @@ from helpers import (
 import rts
 from rts import Camera, InputError
 from rts.scene.camera import look_at, orthographic, perspective
+from rts_surfaces.mesh import Mesh
 
 pytestmark = pytest.mark.rendering
 
@@ -152,13 +153,48 @@ def test_views_near_up_are_continuous():
 @pytest.mark.parametrize("make", [Camera.look_at, Camera.perspective])
 def test_a_field_of_view_in_radians_is_warned_of(make):
     places = ((0, 0, 5), (0, 0, 0)) if make == Camera.look_at else ()
-    for radians in 0.1, np.float32(math.pi / 4), math.pi / 2:
+    for radians in math.radians(10), np.float32(math.radians(15)), 0.6911112, np.float32(math.pi / 4), math.pi / 2:
         with pytest.warns(
             rts.errors.InputWarning, match=r"fov_y is .*, and is in degrees: of radians give math.degrees"
         ):
             make(*places, fov_y=radians)
-    make(*places, fov_y=2.0)
+    for degrees in 2.0, 0.29, 0.19, 0.1, np.float32(0.05), 0.01:  # The others are of telephoto lenses.
+        make(*places, fov_y=degrees)
     Camera.from_blender(np.eye(4), SIZE, focal=5000.0)  # Of half a degree, which nobody gave as an angle.
+
+
+def test_normalised_intrinsics_are_refused_and_scaled_ones_are_not():
+    K = np.array([[1.2, 0, 0.5], [0, 1.6, 0.5], [0, 0, 1]])
+    scaled = np.diag([SIZE[1], SIZE[0], 1]) @ K
+    with pytest.raises(rts.InputError, match=rf"K looks normalised.*np.diag\(\[{SIZE[1]}, {SIZE[0]}, 1\]\) @ K"):
+        Camera.from_opencv(K, np.eye(3), np.zeros(3), SIZE)
+    camera = Camera.from_opencv(scaled, np.eye(3), np.zeros(3), SIZE, pixel_center=0.5)
+    np.testing.assert_allclose(camera.projection[:2, :3], [[2.4, 0, 0], [0, 3.2, 0]], atol=1e-12)
+    # A small image, a wide lens, and a cut-out that begins at the principal point are in pixels.
+    Camera.from_opencv(K, np.eye(3), np.zeros(3), (2, 2))
+    Camera.from_opencv([[8, 0, 32], [0, 8, 24], [0, 0, 1]], np.eye(3), np.zeros(3), (48, 64))
+    Camera.from_opencv([[50, 0, 0], [0, 50, 0], [0, 0, 1]], np.eye(3), np.zeros(3), (48, 64))
+
+
+FLOOR = 2e5 * np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
+
+
+@pytest.mark.parametrize("make", ["look_at", "perspective", "from_opencv", "from_blender"])
+def test_a_floor_reaches_its_horizon(make):
+    """The floor ends where the plane of the eye meets the image: rows above it are empty, the row across it is cut."""
+    size, view, fov = (48, 64), look_at((0, 1.6, 0), (0, 0.3, -10)), 40.0
+    focal = 24 / math.tan(math.radians(20))
+    intrinsics = [[focal, 0, 32], [0, focal, 24], [0, 0, 1]]
+    flipped = np.diag([1.0, -1, -1]) @ view[:3]
+    camera = {
+        "look_at": lambda: Camera.look_at((0, 1.6, 0), (0, 0.3, -10), fov_y=fov),
+        "perspective": lambda: Camera.perspective(fov, view=view),
+        "from_opencv": lambda: Camera.from_opencv(intrinsics, flipped[:, :3], flipped[:, 3], size, pixel_center=0.5),
+        "from_blender": lambda: Camera.from_blender(np.linalg.inv(view), size, focal=focal),
+    }[make]()
+    image = rts.render(rts.Part(Mesh([[0, 1, 2], [0, 2, 3]]), {"vertices": FLOOR}, "silhouette"), camera, size)
+    horizon = 24 - focal * 0.13  # The axis falls by 1.3 in 10.
+    np.testing.assert_allclose(image[..., -1].sum(0), 48 - horizon, atol=2e-3)
 
 
 @pytest.mark.parametrize("make", [Camera.look_at, lambda *a, **k: Camera.orthographic(*a, height=2.0, **k)])
@@ -174,9 +210,9 @@ def test_near_and_far_planes_are_at_clip_minus_one_and_one(make):
         assert clip[2] / clip[3] == pytest.approx(expected)
 
 
-def test_near_and_far_default_to_a_hundredth_and_a_hundred_times_the_distance():
+def test_near_and_far_default_to_a_hundredth_and_a_million_times_the_distance():
     camera = Camera.look_at((0, 0, 5), (0, 0, 0))
-    np.testing.assert_allclose(camera.projection, perspective(45.0, 1.0, 0.05, 500.0))
+    np.testing.assert_allclose(camera.projection, perspective(45.0, 1.0, 0.05, 5e6))
 
 
 def test_the_first_pixel_centre_is_at_one_half():

@@ -27,7 +27,7 @@ from rts.scene.camera import Camera
 from rts.scene.view import Reading, View
 
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-PLANES = (0.01, 1000.0)
+PLANES = (0.01, 1e6)
 """Near and far planes of cameras whose file tells no bounds."""
 MARGIN = 100.0
 """Factor by which a camera's planes lie nearer, and farther, than the bounds of depth in its file."""
@@ -98,7 +98,7 @@ def load_views(
             mean of all cameras, which looks along −z, and so large that the nearest bound is 1 / 0.75. Blender's is the
             same in both; COLMAP and OpenCV have the first alone.
         near: near plane of the cameras; default 0.01, or a hundredth of the nearest bound.
-        far: far plane; default 1000, or a hundred times the farthest bound.
+        far: far plane; default 1e6, or a hundred times the farthest bound.
         cache: True to keep each image, and each mask, once it is read.
 
     Returns:
