@@ -7,6 +7,7 @@ import functools
 import numpy as np
 
 from rts.arrays.argument_checks import is_invertible
+from rts.arrays.value_ranges import largest_absolute
 from rts.errors import InputError
 from rts.scene.camera import Camera
 
@@ -17,8 +18,8 @@ WELL_CONDITIONED = 1e-6
 def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     """The camera of host matrices, refused where it makes no image.
 
-    Its matrices must be finite and invertible. The last row of the view must be 0, 0, 0, 1, and that of the projection
-    0, 0, c ≤ 0, d.
+    Its matrices must be finite and invertible, with entries, and those of their product, of at most `LARGEST`. The last
+    row of the view must be 0, 0, 0, 1, and that of the projection 0, 0, c ≤ 0, d.
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.
@@ -32,6 +33,10 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
             bad = name == "view" and transform is not None and not np.isfinite(transform).all()
             what = "transform of a part" if bad else f"camera's {name} matrix"
             raise InputError(f"the {what} holds NaN or infinity; check how it was made")
+    if max(map(largest_absolute, (camera.view, camera.projection))) > LARGEST:
+        _refuse_large(camera, transform)
+    if largest_absolute(camera.projection @ camera.view) > LARGEST:
+        _refuse_large(camera, transform)
     # Most are far from singular; singular values take longer.
     well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
     if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
@@ -55,6 +60,25 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     if x == y == z == 0 and w == 1:
         return camera
     return camera.replace(view=np.concatenate([camera.view[:3], [[0.0, 0.0, 0.0, 1.0]]]))
+
+
+LARGEST = 1e18
+"""The largest entry of a view, a transform, a projection and their product: with larger ones places in the image
+overflow float32, for vertices of the largest size that is allowed."""
+
+
+def _refuse_large(camera: Camera, transform: np.ndarray | None) -> None:
+    """Raise the error of a camera with an entry larger than `LARGEST`; `transform` is blamed if it has one, too."""
+    blamed = {"transform of a part": transform, "camera's projection matrix": camera.projection}
+    sizes = {name: largest_absolute(np.asarray(x)) for name, x in blamed.items() if x is not None}
+    sizes["camera's view matrix, times the part's transform,"] = largest_absolute(camera.view)
+    with np.errstate(over="ignore", invalid="ignore"):
+        sizes["product of the camera's projection and view"] = largest_absolute(camera.projection @ camera.view)
+    name = next(name for name, size in sizes.items() if size > LARGEST)
+    raise InputError(
+        f"the {name} has an entry of size {sizes[name]:.3g}; expected at most {LARGEST:g}, beyond which places in the "
+        f"image overflow: check how it was made, or choose larger units"
+    )
 
 
 ROUNDING = 1e-6

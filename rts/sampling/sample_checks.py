@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     """The proxy with contiguous arrays of the right dtypes; wrong shapes, widths and indices are refused."""
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
+    if getattr(proxy.vertices, "dtype", None) == np.float64:
+        _check_size(largest_absolute(proxy.vertices), surface)  # In float32 they may be infinite.
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
     faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
     check_faces(Proxy(vertices, faces), surface)
@@ -151,13 +154,27 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
 
 
 def check_proxy(proxy: Proxy, surface: Any) -> None:
-    """Refuse vertices that are NaN or infinite."""
+    """Refuse vertices that are NaN or infinite, or larger than `LARGEST`."""
     vertices = proxy.vertices
-    if not np.isfinite(largest_absolute(vertices)):
+    if not np.isfinite(most := largest_absolute(vertices)):
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         raise InputError(
             f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
             f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
+        )
+    _check_size(most, surface)
+
+
+LARGEST = 1e15
+"""Coordinates that are larger, seen by the largest entries of a camera, have places in the image beyond float32."""
+
+
+def _check_size(most: float, surface: Any) -> None:
+    """Refuse vertices whose largest coordinate is finite, and larger than `LARGEST`."""
+    if LARGEST < most < math.inf:
+        raise InputError(
+            f"the vertices of {surface!r} reach {most:.3g}; expected at most {LARGEST:g}, beyond which places in the "
+            f"image overflow: check the input, choose larger units, or lower the step size if an optimisation led here"
         )
 
 
