@@ -154,8 +154,9 @@ class Mesh(TriangleSurface):
         return theta["vertices"]
 
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The mesh itself, its vertices in float32."""
-        return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids, corners=self._corners)
+        """The mesh itself, its vertices in float32, or in float64 if they are given so."""
+        dtype = np.float64 if inputs.dtype == np.float64 else np.float32
+        return Proxy(np.ascontiguousarray(inputs, dtype=dtype), self.faces, self._ids, corners=self._corners)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated positions and attributes; see the class for their names."""

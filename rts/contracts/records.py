@@ -37,13 +37,17 @@ class Proxy(NamedTuple):
     """Triangles that stand for a surface while it is sampled. Host arrays.
 
     Attributes:
-        vertices: (V, 3) float32, local space.
+        vertices: (V, 3) float32, local space less `origin`. Surfaces may give float64: such vertices that lie far from
+            the origin of local space, as map coordinates do, are rounded to float32 only after an origin near them is
+            subtracted.
         faces: (T, 3) int32.
         ids: (T, I) int32, handed on to the samples of the triangle. None means `faces`; or no ids, if I = 0 and the
             surface has no `refine`.
         corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
         corners: (T, 3) int32, alike for two triangles at a vertex where these have the same attributes; None means
             `faces`. Where they differ at an edge there is a seam, across which colours may change.
+        origin: (3,) float64, what the library has subtracted from the vertices; None for nothing, as surfaces give it.
+            Samplers are told nothing of it: their camera is that of `seen_by`.
     """
 
     vertices: np.ndarray
@@ -51,6 +55,15 @@ class Proxy(NamedTuple):
     ids: np.ndarray | None = None
     corner_params: np.ndarray | None = None
     corners: np.ndarray | None = None
+    origin: np.ndarray | None = None
+
+    def seen_by(self, camera: Any) -> Any:
+        """The camera in the space of `vertices`, from that in local space; host matrices, float64."""
+        if self.origin is None:
+            return camera
+        view = camera.view.copy()
+        view[:3, 3] += view[:3, :3] @ self.origin
+        return camera.replace(view=view)
 
 
 class Fragments(NamedTuple):

@@ -124,7 +124,8 @@ class Points:
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if has_sheets(part, sampler):
-                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index, seams=told.colors)
+                    seen = entry.proxy.seen_by(host)
+                    sheets = Sheets.of(entry.proxy, seen, grid.size, part.cull, index, seams=told.colors)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts, told)
 

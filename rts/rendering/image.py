@@ -97,7 +97,7 @@ def render(
         AspectWarning: the camera is for images of another ratio of width to height.
         InputWarning: samples, or breaks of outlines, find no room in `capacity`; nothing reads an entry of θ; a
             culled part is wound inside out; a sampler cannot sample single points, so that outlines lie midway between
-            centres; vertices of prepared parts have changed.
+            centres; vertices of prepared parts have changed; coordinates are too large for float32.
         LayersWarning: surfaces or light behind the last layer are left out.
     """
     scene, wanted = Scene.of(parts, camera, sampler, engine), None if outputs is None else Outputs(outputs)

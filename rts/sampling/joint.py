@@ -62,7 +62,7 @@ class Joint:
 
     @classmethod
     def of(cls, scene: Scene, first: int, proxies: Sequence[Proxy], cameras: Sequence[Camera]) -> Joint:
-        """Join the parts from `first` on, given their proxies and the camera in the local space of each."""
+        """Join the parts from `first` on, given their proxies and the camera in the space of each, `Proxy.seen_by`."""
         alike = all(np.array_equal(camera.view, cameras[0].view) for camera in cameras[1:])
         vertices = [proxy.vertices for proxy in proxies]
         if not alike:
@@ -162,7 +162,7 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
     proxies, cameras = {}, {}
     for index in indices:
         proxies[index] = scene.entries[index].proxy
-        cameras[index] = scene.local_camera(index, grid)
+        cameras[index] = proxies[index].seen_by(scene.local_camera(index, grid))
 
     def kind(index: int) -> tuple:
         proxy = proxies[index]

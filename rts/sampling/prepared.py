@@ -81,7 +81,8 @@ def warn_of_moved_vertices(parts: Sequence[CheckedPart], entries: Sequence[objec
         if shape_of(vertices) != before.shape or (now := value_of(vertices)) is None:
             continue
         step = max(1, len(before) // LOOKED_AT)
-        if not np.array_equal(np.asarray(now[::step], before.dtype), before[::step]):
+        origin = 0 if entry.proxy.origin is None else entry.proxy.origin
+        if not np.array_equal(np.asarray(now[::step] - origin, before.dtype), before[::step]):
             warn(
                 f"the vertices of part {index} have changed since rts.prepare, whose samples stay where they were: "
                 f"image and gradient are wrong; prepare the part anew, or render it without",

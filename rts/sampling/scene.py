@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rts.advice.bright_textures import warn_of_bright_textures
+from rts.advice.coarse_coordinates import warn_of_coarse_coordinates
 from rts.advice.unread_entries import warn_of_unread
 from rts.advice.winding import warn_of_winding
 from rts.arrays.engines import Context, context_of_scene, is_traced
@@ -77,9 +78,14 @@ class Scene(NamedTuple):
         return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:
-        """The scene with its camera made for images of a size; an AspectWarning if the camera is for another ratio."""
+        """The scene with its camera made for images of a size.
+
+        An AspectWarning if the camera is for another ratio; an InputWarning if coordinates are too large for float32.
+        """
         check_ratio(self.camera, size)
-        return self._replace(camera=self.camera.for_size(size))
+        camera = self.camera.for_size(size)
+        warn_of_coarse_coordinates(self.parts, camera, size, self.context)
+        return self._replace(camera=camera)
 
     def local_camera(self, part: int, grid: Grid) -> Camera:
         """The camera of a grid in the local space of a part."""

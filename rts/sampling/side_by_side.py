@@ -67,7 +67,8 @@ class DrawnView(NamedTuple):
         for local, entry in zip(here.cameras, here.entries, strict=True):
             if not 0 < len(entry.proxy.faces) <= MOST or local.kept_sign(cull) != sign:
                 return None
-            rows = np.concatenate([p[:2] @ local.view, local.view[2:3]])
+            view = entry.proxy.seen_by(local).view
+            rows = np.concatenate([p[:2] @ view, view[2:3]])
             vertices = entry.proxy.vertices @ rows[:, :3].T + rows[:, 3]
             if not _is_inside(vertices, camera, grid.size):
                 return None

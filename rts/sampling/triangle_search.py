@@ -87,13 +87,14 @@ class TriangleSearch:
         def draw(entry: Entry) -> tuple[Entry, Fragments, np.ndarray]:
             if not (count := len(entry.proxy.faces)):
                 return entry, _no_fragments(grid), np.zeros(grid, np.bool_)
-            arguments = entry.prepared, camera, view, layers, self.cull
+            seen = entry.proxy.seen_by(camera)
+            arguments = entry.prepared, seen, view, layers, self.cull
             if points is None:
                 fragments = sampler.rasterize(*arguments)
             else:
                 fragments = sampler.rasterize_points(*arguments, points[0])
                 if fragments is None:
-                    fragments = at_points(entry.proxy, camera, view, layers, self.cull, points[0])
+                    fragments = at_points(entry.proxy, seen, view, layers, self.cull, points[0])
             return entry, fragments, check_fragments(fragments, grid, count, sampler)
 
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)

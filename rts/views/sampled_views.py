@@ -256,7 +256,8 @@ def _drawn(
         return fragments, covered
 
     def draw(b: int) -> None:
-        view_fragments = sampler.rasterize(built.prepared, cameras[b], picture.view, layers, cull)
+        camera = built.proxy.seen_by(cameras[b])
+        view_fragments = sampler.rasterize(built.prepared, camera, picture.view, layers, cull)
         covered[:, *places[b]] = check_fragments(view_fragments, (layers, *picture.view), faces, sampler)
         for to, x in zip(fragments, view_fragments, strict=True):
             to[:, *places[b]] = x

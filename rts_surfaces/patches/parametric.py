@@ -165,8 +165,9 @@ class Parametric(TriangleSurface):
             tiles, tile_shapes = self.tiles, self.shapes(geometry)
             cuts = by_error(tiles, tile_shapes, Allowed.everywhere(len(tile_shapes.bends), float(rate)))
         proxy = triangles(tiles, geometry.points, *cuts)
-        a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
-        return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
+        vertices = np.asarray(proxy.vertices, np.float32)
+        a, b, c = (vertices[proxy.faces[:, i]] for i in range(3))
+        return vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
         """Samples moved to where their rays meet the patches, by Newton's method; `row` is −1 where a ray misses.

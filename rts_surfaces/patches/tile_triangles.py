@@ -166,7 +166,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
             Where a tile or an edge of it is cut at all, the tile's numbers are at least `LEAST` of its number of sides.
 
     Returns:
-        Vertices (V, 3) float32: the tiles' corners, by their numbers, then the points within edges, then those within
+        Vertices (V, 3), as `points` gives them: the tiles' corners, by their numbers, then the points within edges, then those within
         tiles. Faces (T, 3); ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.
 
     Raises:
@@ -181,7 +181,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     within = (inner[:, 0] - 1) * (inner[:, 1] - 1) if width == 4 else (inner[:, 0] - 1) * (inner[:, 0] - 2) // 2
     edge_first = len(tiles.corner_tiles) + np.concatenate([[0], np.cumsum(edges - 1)]).astype(np.int32)
     inner_first = edge_first[-1] + np.concatenate([[0], np.cumsum(within)]).astype(np.int32)
-    vertices = points(*_places(tiles, edges, edge_first, inner, inner_first), 0)[:, 0].astype(np.float32)
+    vertices = points(*_places(tiles, edges, edge_first, inner, inner_first), 0)[:, 0]
     first = np.zeros(count + 1, np.int32)
     tiles_loops.counts(inner, tiles.sides, edges, first)
     out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
