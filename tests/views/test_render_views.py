@@ -248,7 +248,7 @@ LIGHT = {"direction": np.float32([[0, 1, 1], [1, 0, 0.5]]), "ambient": np.float3
 def test_cameras_of_rows_are_those_of_their_views(target):
     flat = Camera.orthographic((0, 2, 3), (0, 0, 0), height=3, near=1, far=8)
     # Planes that float32 tells apart; to it the default far plane is at infinity.
-    first, last = (Camera.look_at(eye, (0, 0, 0), fov_y=45, far=300) for eye in EYES[:2])
+    first, last = (Camera.look_at(eye, (0, 0, 0), fov_y=45, far=30) for eye in EYES[:2])
     cameras = [camera.for_size(SIZE) for camera in (first, flat, last)]
     number = np.array([1, 1, 3, 3, 3, 0], np.int32)  # Nothing is seen in the second, and one row is not used.
     points, direction = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32), (0.3, -0.2, 0.9)
