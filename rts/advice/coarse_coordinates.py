@@ -98,6 +98,8 @@ def _coarsest(
     proxy = surface.proxy(inputs, local, size)
     if not isinstance(proxy, Proxy) or not np.size(proxy.faces):
         return None
+    if not np.issubdtype(np.asarray(proxy.faces).dtype, np.integer):
+        return None  # It is refused later.
     corners = np.asarray(proxy.faces)[:: -(-len(proxy.faces) // LOOKED_AT)].reshape(-1)[::3]
     points = np.asarray(proxy.vertices)
     if points.shape[1:] != (3,) or not 0 <= corners.min() <= corners.max() < len(points):
