@@ -166,8 +166,9 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
             Where a tile or an edge of it is cut at all, the tile's numbers are at least `LEAST` of its number of sides.
 
     Returns:
-        Vertices (V, 3), as `points` gives them: the tiles' corners, by their numbers, then the points within edges, then those within
-        tiles. Faces (T, 3); ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.
+        Vertices (V, 3), as `points` gives them: the tiles' corners, by their numbers, then the points within edges,
+        then those within tiles. Faces (T, 3); ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2),
+        (u, v) in that patch.
 
     Raises:
         InputError: more than `MOST_TRIANGLES` triangles.
