@@ -128,10 +128,13 @@ class TestCells(OperationConformance):
     def operation(self):
         return CELLS
 
-    @pytest.fixture(params=["panes", "panes, some layers empty"])
+    @pytest.fixture(params=["panes", "panes, some layers empty", "panes, some of alpha 1"])
     def operands(self, request):
         positions, rgba, row, joined = operands_of("panes", "CELLS")
-        if request.param != "panes":
+        if request.param == "panes, some of alpha 1":
+            rgba = rgba.copy()
+            rgba[::2, -1] = 1
+        elif request.param != "panes":
             row = row.copy()
             row[0, ::3], row[1, :, ::4] = -1, -1
             assert ((row[0] < 0) & (row[1] >= 0)).any()
