@@ -39,12 +39,14 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
         area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
-        if area == 0 or np.isnan(area):
+        # Not by the least and the largest of the corners: these leave out those behind the camera, which are NaN.
+        whole = not np.isnan(area)
+        if area == 0 or not whole:
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        small, middling = True, True
+        small, middling = whole, whole
         for axis in range(2):
             wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
-            small, middling = small & (wide <= WIDTHS[0]), middling & (wide <= WIDTHS[1])  # False for NaN.
+            small, middling = small & (wide <= WIDTHS[0]), middling & (wide <= WIDTHS[1])
         size = SMALL if small else (MIDDLING if middling else LARGE)
         sides[t] = size if area > 0 else (-size if area < 0 else 0)
 
