@@ -211,7 +211,23 @@ def depth(mended):
     return lambda p: (moved(part, xp(p).stack([0 * p, 0 * p, p])), camera), np.array(0.0), {}
 
 
+def striped(mended):
+    """A card that is red right of a place in the world, and blue left of it; `mended`, it is a ramp."""
+
+    def scene(p):
+        def shader(theta, gbuffer, camera):
+            xp, x = rts.namespace(p), gbuffer["position"][:, :1] - p[1]
+            red = 1 / (1 + xp.exp(-x / 1.5)) if mended else xp.where(x > 0.2, 1.0 + 0 * x, 0 * x)
+            return xp.concat([constant(p, RED) * red + constant(p, BLUE) * (1 - red), 1 + 0 * x], axis=1)
+
+        shader.opaque = True
+        return moved(NEAR.replace(shader=shader), p[:1]), CAMERA
+
+    return scene, np.array([0.1, 0.3]), {"entries": 2}
+
+
 SCENES = {
+    striped: "steps",
     outside: "outside",
     behind: "outside",
     hidden: "hidden",
@@ -257,6 +273,18 @@ def test_what_is_broken_is_named(make):
 @pytest.mark.parametrize("make", quick(SCENES, 8))
 def test_what_is_mended_is_not_named(make):
     assert SCENES[make] not in {r.kind for r in check(make, mended=True).reasons}
+
+
+@pytest.mark.parametrize("at", [0.3, 0.37])
+def test_steps_are_named_where_a_number_moves_nothing_else(at):
+    """The place of the step itself: at 0.3 it lies on centres of pixels, else between these."""
+    scene, _, _ = striped(False)
+    start = arrays("torch-cpu", np.array([0.1, at]))
+    found = rts.check_gradient(scene, start, SIZE, budget_s=600, samples=5)
+    reasons = [r for r in found.reasons if "parameters[1]" in r.parameters]
+    assert [r.kind for r in reasons] == ["steps"] and "colours of part 0 step" in reasons[0].text
+    columns = np.flatnonzero(reasons[0].pixels.any(axis=0))
+    assert len(columns) and np.abs(columns + 0.5 - (16.2 + at)).max() < 4
 
 
 def test_a_gradient_that_agrees_needs_no_reason():

@@ -9,9 +9,10 @@ import numpy as np
 
 from rts.diagnostics.gradient_reasons import variants
 from rts.diagnostics.gradient_reasons.reasons import Finding
+from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
 from rts.diagnostics.gradient_reasons.slopes import Number
 from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched
-from rts.diagnostics.gradient_reasons.vanishing import why_constant
+from rts.diagnostics.gradient_reasons.vanishing import is_quiet, why_constant
 from rts.diagnostics.smoothing import low_pass
 
 HALVED = 0.5
@@ -216,6 +217,27 @@ def _bounded(case: _Case, touched: Touched) -> None:
     case.error = case.error.within(case.left)
 
 
+def _steps(case: _Case, touched: Touched) -> None:
+    """Add a finding on shaders that step, if much of the error is beside pixels that do.
+
+    These are then explained.
+    """
+    from scipy.ndimage import binary_dilation
+
+    steps = why_stepped(case.subject, case.number, case.connected, far=is_quiet(case.number.pushed))
+    if steps is None:
+        return
+    near: Any = binary_dilation(steps.mask, iterations=WIDER)
+    energy = case.error.energy
+    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
+    if held < LARGE_SHARE:
+        return
+    share = held * case.error.norm**2 / case.whole.norm**2
+    case.findings.append(steps._replace(mask=near & case.strong(case.error), share=share))
+    case.left &= ~near
+    case.error = case.error.within(case.left)
+
+
 def _samples(case: _Case, touched: Touched) -> None:
     """Add a finding on too few samples, if more make the error much smaller."""
     taken = case.subject.supersample
@@ -249,6 +271,7 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _splatter,
     _layers,
     _bounded,
+    _steps,
     _samples,
     _unknown,
 )

@@ -21,6 +21,7 @@ KINDS = {
     "layers": ("magenta", (255, 60, 220)),
     "samples": ("olive", (150, 150, 30)),
     "bounded": ("violet", (150, 60, 255)),
+    "steps": ("lime", (150, 255, 60)),
     "reach": ("brown", (170, 95, 30)),
     "infinite": ("gold", (200, 160, 0)),
     "undetermined": ("none", None),
@@ -38,6 +39,7 @@ KINDS = {
 - layers: surfaces lie deeper than K layers.
 - samples: too few samples a pixel, such as for colours finer than pixels.
 - bounded: near-singular crossings, whose derivatives the surface bounds.
+- steps: colours of a shader step, such as by a comparison: a step has no derivative.
 - reach: the loss is flat here, beyond the reach of a pixel.
 - infinite: the derivative is NaN, or infinite.
 - undetermined: the image does not determine the number, or a combination of several.

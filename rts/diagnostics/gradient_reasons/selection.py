@@ -8,6 +8,7 @@ import numpy as np
 
 from rts.diagnostics.gradient_reasons.disagreeing import why_off
 from rts.diagnostics.gradient_reasons.reasons import Finding, Reason, merged
+from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
 from rts.diagnostics.gradient_reasons.slopes import Number, Slope
 from rts.diagnostics.gradient_reasons.subject import Subject, Touched
 from rts.diagnostics.gradient_reasons.vanishing import (
@@ -85,6 +86,9 @@ def _why(
         return why_nothing(subject, number, touched(), going)
     if not agrees(number.slope):
         return why_off(subject, number, touched(), going)
-    if is_quiet(number.pushed) and (constants := why_constant(subject, touched())):
-        return constants  # The truth is too noisy to tell, but the scene does.
+    if is_quiet(number.pushed):  # The truth is too noisy to tell, but the scene does.
+        if constants := why_constant(subject, touched()):
+            return constants
+        if going() and (steps := why_stepped(subject, number, far=True)):
+            return [steps]
     return why_flat(subject, number, going) if own_loss else []

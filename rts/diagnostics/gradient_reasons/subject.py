@@ -157,8 +157,11 @@ class Subject:
             connect: True to move arrays that no derivative reaches, too.
             **options: options of `rts.render`.
         """
+        return self.pushed(partial(self.drawn, change=change, **options), direction, connect)
+
+    def pushed(self, draw: Callable[[tuple[Any, Camera]], Array], direction: Tree, connect: bool = False) -> np.ndarray:
+        """The derivative of what `draw` gives for a scene, an array of the engine, along a direction; see `push`."""
         one, unit, at = self._line(direction, connect)
-        draw = partial(self.drawn, change=change, **options)
         return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
     def step(

@@ -13,6 +13,7 @@ from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.checked_parts import check_scene
 from rts.diagnostics.gradient_reasons import variants
 from rts.diagnostics.gradient_reasons.reasons import Finding
+from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
 from rts.diagnostics.gradient_reasons.slopes import Number
 from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched, listed_parts
 from rts.fitting.dependence import directions_in_words
@@ -68,8 +69,10 @@ def why_nothing(subject: Subject, number: Number, touched: Touched, going: Calla
         finding = experiment(subject, trial, indices, what)
         if finding is not None:
             return [finding]
+    steps = why_stepped(subject, number, far=True) if going() else None
     return [
-        Finding(
+        steps
+        or Finding(
             "undetermined",
             f"no experiment shows it: it changes something of {what}, but no pixel, in the view, around it or beneath",
             "No image like this one determines it; fix it, or take another view or shader.",
