@@ -24,7 +24,7 @@ from rts.diagnostics.gradient_reasons.shared_budget import Clock, looked_at
 from rts.diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Slope
 from rts.diagnostics.gradient_reasons.subject import Scene, Subject
 from rts.diagnostics.progress import phases
-from rts.errors import EmptyImageWarning, InputError, LayersWarning
+from rts.errors import EmptyImageWarning, InputError, InputWarning, LayersWarning
 from rts.rendering.image import render
 
 LOSS_SMOOTHNESS = 4.0
@@ -150,6 +150,8 @@ def check_gradient(
         # The check itself tells why nothing is seen.
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
+        if hessian:
+            warnings.filterwarnings("ignore", "second derivatives of an image", InputWarning)
         subject.require_dependence()
         if hessian:
             require_second_derivatives(subject)

@@ -14,7 +14,7 @@ from rts.arrays.array_functions import from_numbers, kind_of
 from rts.arrays.engines import OWNERS, constants, context_of, engine_of, value_of
 from rts.arrays.trees import Array
 from rts.compiling.threads import read_only
-from rts.errors import InputError, RtsError
+from rts.errors import InputError, InputWarning, RtsError, warn
 
 _SHAPE = attrgetter("shape")
 
@@ -70,6 +70,8 @@ class Operation:
             then take a keyword `kept`: that object, or None if it is lost.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). Otherwise it is called
             for each direction.
+        second: what to warn of where a derivative of a derivative is asked for in which the first operand has a part;
+            for array code whose second derivatives are not those of what its value stands for. Empty for nothing.
     """
 
     name: str
@@ -85,6 +87,7 @@ class Operation:
     used: Callable[[Arrays], int] | None = None
     keeps: bool = False
     sweeps: bool = False
+    second: str = ""
 
     @classmethod
     def of_loops(
@@ -148,6 +151,8 @@ class Operation:
             if type(getattr(self, name)) is not bool:
                 value = quoted(getattr(self, name))
                 raise InputError(f"{name} of the operation {self.name} is {value}; expected True or False")
+        if not isinstance(self.second, str):
+            raise InputError(f"second of the operation {self.name} is {quoted(self.second)}; expected a text, or ''")
         self._check_indices()
 
     def _integers(self, name: str) -> tuple[int, ...]:
@@ -218,6 +223,11 @@ class Operation:
             if dtype != first and dtype.kind not in "iub":
                 return False
         return True
+
+    def warn_of_second(self) -> None:
+        """Warn of `second`, if there is something; engines' binders call it where the first operand has a part."""
+        if self.second:
+            warn(self.second, InputWarning)
 
     # Engines' binders call the methods below, with operands in NumPy.
 

@@ -115,5 +115,7 @@ SPLAT = Operation(
     push=_push,
     pull=_pull,
     differentiable=2,
+    second="second derivatives of an image, in what moves, leave out how outlines curve with the splatter 'edges', and "
+    'may be many times too small; take Gauss–Newton (rts.fit with method="lm"), or differences of gradients',
 )
 """The operation of `splat`, of positions, colours, `front`, and the fields of `Stencil` up to `motion_colors`."""

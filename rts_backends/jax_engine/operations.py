@@ -307,6 +307,8 @@ class _Differentiable:
         _, moved = _present(tangents[:n])
         if not any(moved):
             return None
+        if moved[0] or params["wanted"][0]:
+            self.operation.warn_of_second()
         fixed = [x for x, m in zip(primals[:n], moved, strict=True) if not m]
 
         def function(*moving: jax.Array) -> list[jax.Array]:

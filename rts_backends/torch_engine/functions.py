@@ -42,6 +42,13 @@ def foreign(*tensors: Tensor | None) -> bool:
     return False
 
 
+def is_zero(x: Tensor | None) -> bool:
+    """True if a gradient or a tangent is 0 throughout, in all items of a batch; False where it hides its values."""
+    if x is None or foreign(x):
+        return x is None
+    return not torch_internals.value_within(x, lambda value: bool((value != 0).any()))
+
+
 def tangent_alike(x: Tensor) -> Tensor:
     """`x` with its tangent, if it has one, in the dtype of `x`.
 

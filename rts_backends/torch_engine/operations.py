@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, foreign, on_host, transformed
+from rts_backends.torch_engine.functions import along, foreign, is_zero, on_host, transformed
+from rts_backends.torch_engine.torch_internals import is_asked_for
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -95,6 +96,18 @@ class _Call:
                 _specifying.on = before
 
         return specified
+
+    def warn_of_second(self, asked: Callable[[int], bool], before: Callable[[], bool]) -> None:
+        """Warn of second derivatives in which the first operand has a part, if the operation has a warning.
+
+        Args:
+            asked: k → whether this derivative is by operand k.
+            before: whether the one before was by the first operand, among others.
+        """
+        if not self.operation.second:
+            return
+        if asked(0) or (any(asked(k) for k in range(1, self.count)) and before()):
+            self.operation.warn_of_second()
 
     def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
         """The pullback of the array code, as a function of the differentiable operands and the result's gradient.
@@ -217,12 +230,14 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
+        ctx.call.warn_of_second(lambda k: is_asked_for(ctx, k), lambda: not is_zero(gradients[0]))
         pull, primals, fixed = _Pull._differentiable(ctx)
         *found, g = torch.func.vjp(pull, *primals)[1](gradients)
         return None, None, *found, *[None] * fixed, g
 
     @staticmethod
     def jvp(ctx, *tangents):
+        ctx.call.warn_of_second(lambda k: not is_zero(tangents[2 + k]), lambda: ctx.wanted[0])
         pull, primals, _ = _Pull._differentiable(ctx)
         return along(pull, primals, (*tangents[2 : 2 + ctx.call.count], tangents[-1]))
 
@@ -262,13 +277,20 @@ class _Push(torch.autograd.Function):
         return ctx.call.pushed(ctx.present, fixed), (*varied, *arrays[-count:]), len(fixed)
 
     @staticmethod
+    def _moves_first(ctx):
+        """True if the first operand has a tangent."""
+        return ctx.present[0] and not is_zero(ctx.saved_tensors[-sum(ctx.present)])
+
+    @staticmethod
     def backward(ctx, *gradients):
+        ctx.call.warn_of_second(lambda k: is_asked_for(ctx, k), lambda: _Push._moves_first(ctx))
         push, primals, fixed = _Push._differentiable(ctx)
         found, n = torch.func.vjp(push, *primals)[1](gradients[0]), ctx.call.count
         return None, None, *found[:n], *[None] * fixed, *found[n:]
 
     @staticmethod
     def jvp(ctx, *tangents):
+        ctx.call.warn_of_second(lambda k: not is_zero(tangents[2 + k]), lambda: _Push._moves_first(ctx))
         push, primals, _ = _Push._differentiable(ctx)
         return along(push, primals, (*tangents[2 : 2 + ctx.call.count], *tangents[-sum(ctx.present) :]))
 

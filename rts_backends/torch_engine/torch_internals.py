@@ -4,6 +4,8 @@
   transforms, and so are packed rows without padding.
 - `value_within` reads values inside of transforms.
 - `is_legacy_batchedtensor` finds the batches of `torch.autograd.grad(..., is_grads_batched=True)`.
+- `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
+  alone are wanted.
 - `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
 
 With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
@@ -81,6 +83,15 @@ except ImportError:
             tensor.data_ptr()
         except RuntimeError:
             return False
+        return True
+
+
+def is_asked_for(ctx: Any, k: int) -> bool:
+    """True if this backward pass goes on to the k-th tensor of a `Function`; also where torch does not tell."""
+    node = ctx.next_functions[k][0]
+    try:
+        return node is not None and torch._C._will_engine_execute_node(node)
+    except (AttributeError, RuntimeError):  # An older torch; or a leaf, of which torch does not tell.
         return True
 
 

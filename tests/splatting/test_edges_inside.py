@@ -34,7 +34,8 @@ def room(turns, parts, vertices=CORNERS, colors=((1.0, 1, 1), (1.0, 1, 1))):
 
 @pytest.mark.parametrize("parts", [1, 2])
 def test_white_walls_fill_the_image_whatever_the_order_of_corners(parts):
-    for turns in itertools.product(TURNS, repeat=4):
+    for one, other, last in itertools.product(TURNS, repeat=3):
+        turns = one, one, other, last
         image = rts.render(room(turns, parts), CAMERA, SIZE, splatter="edges")
         np.testing.assert_allclose(image, np.ones((*SIZE, 4)), atol=1e-6, err_msg=str(turns))
 

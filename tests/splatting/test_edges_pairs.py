@@ -111,6 +111,7 @@ def test_torch_func_sees_the_loss_that_is_drawn(shader):
     ids=["hessian", "forward over reverse", "reverse over forward", "reverse over reverse", "jvp of grad"],
 )
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore:second derivatives of an image")
 def test_second_derivatives_by_torch_func_are_those_of_reverse_mode_twice(transform):
     loss, zero = hexagonal("normals")
     found, expected = transform(loss)(zero), reversed_twice(loss, zero)
