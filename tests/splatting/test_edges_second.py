@@ -132,7 +132,7 @@ def test_second_derivatives_of_torch_warn_and_lack_the_curvature_of_outlines(way
 def test_first_derivatives_of_torch_and_second_ones_of_colours_do_not_warn(way):
     pytest.importorskip("torch")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", rts.errors.RtsWarning)
         torch_once()[way](arrays("torch-cpu", START))
 
 
@@ -141,7 +141,7 @@ def test_fits_by_gauss_newton_do_not_warn():
     pytest.importorskip("torch")
     target = image(arrays("torch-cpu", START)).detach()
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", rts.errors.RtsWarning)
         start = arrays("torch-cpu", START + [0.4, 0.1])
         found = rts.fit(lambda p: (image(p) - target).reshape(-1), start, method="lm", steps=8)
     np.testing.assert_allclose(to_numpy(found.parameters), START, atol=0.01)
@@ -182,5 +182,5 @@ def test_first_derivatives_of_jax_do_not_warn(way):
         "grey": lambda p: jax.hessian(loss_in_grey)(p[1]),
     }
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", rts.errors.RtsWarning)
         ways[way](arrays("jax", START))
