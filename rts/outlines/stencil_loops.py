@@ -174,7 +174,10 @@ def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
 
 @compiled
 def _fill_order(count, sides, at, breaks, order):
-    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start."""
+    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start.
+
+    The first comes again at the end, so that each has one after it.
+    """
     for e in range(count):
         here = e
         while here > 0:
@@ -185,6 +188,7 @@ def _fill_order(count, sides, at, breaks, order):
             order[here] = other
             here -= 1
         order[here] = e
+    order[count] = order[0]
 
 
 @compiled
@@ -260,13 +264,13 @@ def _fill_regions(count, order, hubs, region):
     for p in range(count):
         region[p] = p
     for p in range(count):
-        before = (p - 1) % count
+        last = p - 1 if p > 0 else count - 1
+        before = last
         while hubs[order[before]] != hubs[order[p]]:
-            before = (before - 1) % count
-        own, other = region[before], region[(p - 1) % count]
+            before = before - 1 if before > 0 else count - 1
+        own, other = region[before], region[last]
         for q in range(count):
-            if region[q] == other:
-                region[q] = own
+            region[q] = own if region[q] == other else region[q]
 
 
 @compiled
@@ -303,9 +307,9 @@ def _add_areas(
     for p in range(count):
         area[p] = 0.0
         here += sides[order[p]] < corner
-    own = region[here % count]
+    own = region[here] if here >= 0 else region[count - 1]
     for p in range(count):
-        area[region[p]] += weight[order[p], corner] - weight[order[(p + 1) % count], corner]
+        area[region[p]] += weight[order[p], corner] - weight[order[p + 1], corner]
     area[own] += 0.25
     total = 0.0
     for p in range(count):
@@ -323,13 +327,13 @@ def _add_areas(
             of_hub[hubs[order[p // 2]]] = 0.0
         total = 0.0
         for p in range(2 * count):
-            ray = order[(p + 1) // 2 % count]  # Of each piece of the sides the rays at both ends.
+            ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
             if region[p // 2] == r:
                 of_hub[hubs[ray], 0] += length[ray, corner] + 1e-9
                 of_hub[hubs[ray], 1] += 1
                 total += length[ray, corner] + 1e-9
         for p in range(2 * count):
-            ray = order[(p + 1) // 2 % count]
+            ray = order[(p + 1) // 2]
             if region[p // 2] != r:
                 continue
             share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
@@ -383,7 +387,7 @@ def _add_squares(
             stop += 1
         most, first = max(most, stop - first), stop
     sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
-    order, hubs = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
     region = np.empty(2 * most, np.int64)
     last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
     weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
@@ -545,19 +549,27 @@ def _add_motion(motions, m, cell, sample, share, moves, color, other):
 
 @compiled
 def _by_cells(cell, count, cells):
-    """The entries of each cell: `first` (cells + 1,), and `order` (count,), in which they lie."""
-    first, order = np.zeros(cells + 1, np.int64), np.empty(count, np.int64)
+    """The cells that have entries, in order; where those of each begin in `order`, and this, the order of entries."""
+    number, found, several = np.full(cells, -1, np.int32), np.empty(min(count, cells), np.int32), 0
     for n in range(count):
-        first[cell[n] + 1] += 1
-    for c in range(cells):
-        first[c + 1] += first[c]
+        if number[cell[n]] < 0:
+            number[cell[n]], found[several], several = several, cell[n], several + 1
+    found = np.sort(found[:several])
+    for i in range(several):
+        number[found[i]] = i
+    first, order = np.zeros(several + 1, np.int64), np.empty(count, np.int64)
     for n in range(count):
-        order[first[cell[n]]] = n
-        first[cell[n]] += 1
-    for c in range(cells, 0, -1):
-        first[c] = first[c - 1]
+        first[number[cell[n]] + 1] += 1
+    for i in range(several):
+        first[i + 1] += first[i]
+    for n in range(count):
+        at = number[cell[n]]
+        order[first[at]] = n
+        first[at] += 1
+    for i in range(several, 0, -1):
+        first[i] = first[i - 1]
     first[0] = 0
-    return first, order
+    return found, first, order
 
 
 @compiled(inline="always")
@@ -577,18 +589,16 @@ def _sorted_colors(colors, count, fronts, real):
     fill the cell, and of a colour no more is taken than there is.
     """
     raw_cell, raw_color, raw_weight, raw_from = colors
-    first, order = _by_cells(raw_cell, count, fronts.size)
+    found, first, order = _by_cells(raw_cell, count, fronts.size)
     cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, real.dtype)
     most = 0
-    for c in range(fronts.size):
-        most = max(most, first[c + 1] - first[c])
-    color, weight, n = np.empty(most + 1, np.int32), np.empty(most + 1), 0
-    for c in range(fronts.size):
-        if first[c + 1] == first[c]:
-            continue
-        own, several = fronts[c // fronts.shape[1], c % fronts.shape[1]], 1
+    for i in range(len(found)):
+        most = max(most, first[i + 1] - first[i])
+    color, weight, front, n = np.empty(most + 1, np.int32), np.empty(most + 1), fronts.reshape(-1), 0
+    for i in range(len(found)):
+        own, several = front[found[i]], 1
         color[0], weight[0] = own, 1.0 if own >= 0 else 0.0
-        for e in range(first[c], first[c + 1]):  # In the order of entries: areas before what is taken of them.
+        for e in range(first[i], first[i + 1]):  # In the order of entries: areas before what is taken of them.
             entry, taken = order[e], raw_weight[order[e]]
             if raw_from[entry] >= 0:
                 at = _at(color, several, raw_from[entry])
@@ -601,33 +611,25 @@ def _sorted_colors(colors, count, fronts, real):
         for e in range(several):
             share = max(weight[e], 0.0) - (1 if e == 0 and own >= 0 else 0)
             if share != 0 and color[e] >= 0:
-                cell_of[n], color_of[n], weight_of[n] = c, color[e], share
+                cell_of[n], color_of[n], weight_of[n] = found[i], color[e], share
                 n += 1
     return cell_of[:n], color_of[:n], weight_of[:n]
 
 
 @compiled
 def _sorted_motions(motions, count, cells, real):
-    """Entries of motions by cell, in the dtype of `real`; those of one sample and the same colours are one."""
-    raw_cell, raw_sample, raw_weight, raw_colors = motions
-    first, order = _by_cells(raw_cell, count, cells)
+    """Entries of motions by cell, in the dtype of `real`."""
+    cell, sample, weight, colors = motions
+    _, _, order = _by_cells(cell, count, cells)
     cell_of, sample_of = np.empty(count, np.int32), np.empty(count, np.int32)
-    weight_of, colors_of, m = np.zeros((count, 3), real.dtype), np.empty((count, 2), np.int32), 0
-    for c in range(cells):
-        start = m
-        for e in range(first[c], first[c + 1]):
-            entry, at = order[e], start
-            sample, before, behind = raw_sample[entry], raw_colors[entry, 0], raw_colors[entry, 1]
-            while at < m and not (
-                sample_of[at] == sample and colors_of[at, 0] == before and colors_of[at, 1] == behind
-            ):
-                at += 1
-            if at == m:
-                cell_of[m], sample_of[m], m = c, sample, m + 1
-                colors_of[at, 0], colors_of[at, 1] = before, behind
-            for a in range(3):
-                weight_of[at, a] += raw_weight[entry, a]
-    return cell_of[:m], sample_of[:m], weight_of[:m], colors_of[:m]
+    weight_of, colors_of = np.empty((count, 3), real.dtype), np.empty((count, 2), np.int32)
+    for m in range(count):
+        entry = order[m]
+        cell_of[m], sample_of[m] = cell[entry], sample[entry]
+        colors_of[m, 0], colors_of[m, 1] = colors[entry, 0], colors[entry, 1]
+        for a in range(3):
+            weight_of[m, a] = weight[entry, a]
+    return cell_of, sample_of, weight_of, colors_of
 
 
 @loop

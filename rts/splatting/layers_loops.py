@@ -9,10 +9,13 @@ from rts.compiling.loops import compiled, loop
 
 @compiled(inline="always")
 def _weigh(rgba, row, stacks, m, samples, layers, through):
-    """Fill in the samples (K,) of a cell or a stack, their layers, and the light; returns their number."""
-    light, count, alpha, width, cells = 1.0, 0, rgba.shape[1] - 1, row.shape[2], row.shape[1] * row.shape[2]
+    """Fill in the samples (K,) of a cell or a stack, their layers, and the light; returns their number.
+
+    `row` is (K, H · W).
+    """
+    light, count, alpha, cells = 1.0, 0, rgba.shape[1] - 1, row.shape[1]
     for k in range(len(row)):
-        n = row[k, m // width, m % width] if m < cells else stacks[m - cells, k]
+        n = row[k, m] if m < cells else stacks[m - cells, k]
         if n >= 0:
             samples[count], layers[count], through[count] = n, k, light
             light *= 1 - rgba[np.uint32(n), alpha]
@@ -32,7 +35,8 @@ def _beside(row, joined, k, y, x, axis):
 @loop
 def value(first, last, rgba, row, stacks, out):
     """Fill rows `first` to `last` of `out` (2 H · W + R, C): composites; and, for cells, zeros at the end."""
-    width, cells = row.shape[2], row.shape[1] * row.shape[2]
+    row = row.reshape((len(row), -1))
+    cells = row.shape[1]
     for m in range(first, last):
         light = 1.0
         for c in range(out.shape[1]):
@@ -40,7 +44,7 @@ def value(first, last, rgba, row, stacks, out):
             if m < cells:
                 out[cells + len(stacks) + m, c] = 0.0
         for k in range(len(row)):
-            n = row[k, m // width, m % width] if m < cells else stacks[m - cells, k]
+            n = row[k, m] if m < cells else stacks[m - cells, k]
             if n >= 0:
                 for c in range(out.shape[1]):
                     out[m, c] += light * rgba[np.uint32(n), c]
@@ -53,13 +57,14 @@ def push(first, last, rgba, row, joined, stacks, t_positions, t_rgba, out):
     most, count, width, cells = len(row), rgba.shape[1], row.shape[2], row.shape[1] * row.shape[2]
     samples, layers = np.empty(most, np.uint32), np.empty(most, np.uint32)
     through, behind, alpha = np.empty(most), np.empty((most + 1, count)), count - 1
+    flat = row.reshape((most, -1))
     for m in range(first, last):
         moved = cells + len(stacks) + m
         for c in range(count):
             out[m, c] = 0.0
             if m < cells:
                 out[moved, c] = 0.0
-        reached = _weigh(rgba, row, stacks, m, samples, layers, through)
+        reached = _weigh(rgba, flat, stacks, m, samples, layers, through)
         for c in range(count):
             behind[reached, c] = 0.0
         for k in range(reached - 1, -1, -1):
@@ -97,11 +102,11 @@ def pull(rgba, row, joined, stacks, g, g_positions, g_rgba):
     """Add to gradients of samples those of `g` (2 H · W + R, C); empty ones are not wanted."""
     most, width, cells = len(row), row.shape[2], row.shape[1] * row.shape[2]
     samples, layers, through = np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most)
-    alpha = rgba.shape[1] - 1
+    alpha, flat = rgba.shape[1] - 1, row.reshape((most, -1))
     for m in range(cells + len(stacks)):
         # What is behind a layer, times the gradient: all that is asked of it.
         behind, moved_behind, moved = 0.0, 0.0, cells + len(stacks) + m
-        for k in range(_weigh(rgba, row, stacks, m, samples, layers, through) - 1, -1, -1):
+        for k in range(_weigh(rgba, flat, stacks, m, samples, layers, through) - 1, -1, -1):
             n, light = samples[k], through[k]
             passed, own, own_moved = 1 - rgba[n, alpha], 0.0, 0.0
             if len(g_rgba):
