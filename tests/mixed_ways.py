@@ -13,6 +13,7 @@ import warnings
 
 import numpy as np
 import pytest
+from found_outlines import sampled_with_outlines
 from helpers import arrays, derivative, gradient, to_numpy
 from mixed_scenes import mixed_of
 
@@ -20,9 +21,7 @@ import rts
 from rts.arrays.trees import leaves, map_leaves
 from rts.compiling import threads
 from rts.rendering.settings import RenderSettings
-from rts.splatting.edges import splatter as edges
-from rts.splatting.edges import stack_sides
-from rts.splatting.edges import stacks as edges_stacks
+from rts.splatting import layers, stencil
 
 SAMPLERS = ("embree", "reference")
 """Names of samplers, in place of "raster"."""
@@ -164,8 +163,9 @@ def least_capacity(scene, cameras, options):
 
 def room_for_breaks(scene, cameras, options):
     """A capacity with which programs have room for the breaks of all views; None if they have it anyway."""
-    sampled = [rts.sample(_parts(scene, _values(scene)), camera, scene.size, **options) for camera in cameras]
-    most, row = max(len(s.outlines.gap) for s in sampled), sampled[0].row
+    parts = _parts(scene, _values(scene))
+    found = [sampled_with_outlines(parts, camera, scene.size, **options) for camera in cameras]
+    most, row = max(len(outlines.gap) for _, outlines in found), found[0][0].row
     given = options.get("capacity")
     if most <= 8 * sum(row.shape[1:]):
         return given
@@ -210,9 +210,8 @@ def _patched(way):
         if "bands" in way:
             patch.setattr(RenderSettings, "bands", _thin_bands)
         if "specified" in way:
-            patch.setattr(edges, "EDGES", edges.specification)
-            patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
-            patch.setattr(stack_sides, "SIDES", stack_sides._specification)
+            patch.setattr(stencil, "SPLAT", stencil._specification)
+            patch.setattr(layers, "LAYERS", layers._specification)
         yield
 
 

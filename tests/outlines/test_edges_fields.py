@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from found_outlines import sampled_with_outlines
 
 import rts
 
@@ -68,20 +69,20 @@ def test_a_field_without_slope_at_its_surface_has_outlines_that_move():
 
 def test_a_smooth_front_has_no_breaks_beside_its_outline():
     part = rts.Part(rts.Sdf(ball, 1.6), {"radius": np.float32(0.7)}, "silhouette")
-    outlines = rts.sample(part, CAMERA, (SIZE, SIZE), splatter="edges").outlines
+    _, outlines = sampled_with_outlines(part, CAMERA, (SIZE, SIZE), splatter="edges")
     assert len(outlines.rows) > 30
-    assert ((outlines.rows >= 0).sum(axis=1) == 1).all()
+    assert ((outlines.rows[:, :2] >= 0).sum(axis=1) == 1).all()
 
 
 def test_pairs_lie_on_the_rays_of_breaks():
     part = rts.Part(rts.Sdf(diamond, 1.6), {"radius": np.float32(0.7)}, "silhouette")
-    sampled = rts.sample(part, CAMERA, (SIZE, SIZE), splatter="edges")
-    outlines, points = sampled.outlines, sampled.samples[0].params[:, :3].astype(float)
+    sampled, outlines = sampled_with_outlines(part, CAMERA, (SIZE, SIZE), splatter="edges")
+    points, pair = sampled.samples[0].params[:, :3].astype(float), outlines.rows[:, 4:]
     ending = outlines.rows[np.arange(len(outlines.near)), outlines.near]
-    assert (outlines.pair >= 0).all()
+    assert (pair >= 0).all()
 
     def seen(rows):
         return points[rows, :2] / (DISTANCE - points[rows, 2:])
 
     for side in (0, 1):
-        np.testing.assert_allclose(seen(outlines.pair[:, side]), seen(ending), atol=1e-5)
+        np.testing.assert_allclose(seen(pair[:, side]), seen(ending), atol=1e-5)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from found_outlines import sampled_with_outlines
 from helpers import TORCH, arrays, quick, to_numpy
 
 import rts
@@ -209,19 +210,20 @@ def paired(name, way):
     f, q, eye, _ = SHAPES[name]
     surface, options = WAYS[way](lambda theta, p: f(theta["q"], p))
     part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
-    found = rts.sample(part, camera(eye), SIZE, **options)
+    found, outlines = sampled_with_outlines(part, camera(eye), SIZE, **options)
     points = np.asarray(surface.evaluate(part.theta, found.samples[0])["position"])
     wide = camera(eye).for_size(SIZE).with_apron(SIZE, found.apron)
     places = np.asarray(wide.project(points, found.row.shape[1:]))
-    return found.outlines, places[np.maximum(found.outlines.pair, 0)], places
+    return outlines, places[np.maximum(outlines.rows[:, 4:], 0)], places
 
 
 @pytest.mark.parametrize("way", quick(list(WAYS), 4))
 def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     outlines, pairs, places = paired("torus across", way)
-    there, index = outlines.pair[:, 0] >= 0, np.arange(len(outlines.near))
+    pair = outlines.rows[:, 4:]
+    there, index = pair[:, 0] >= 0, np.arange(len(outlines.near))
     # Rays leave a band where pixels are wider than cells.
-    assert there.mean() > (0.1 if way == "band" else 0.9) and (outlines.pair[~there] == -1).all()
+    assert there.mean() > (0.1 if way == "band" else 0.9) and (pair[~there] == -1).all()
     last = places[outlines.rows[index, np.minimum(outlines.near, 1)]]
     for side in (0, 1):
         np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)

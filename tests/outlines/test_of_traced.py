@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from found_outlines import sampled_with_outlines
 from helpers import box, icosphere, quick, relative_error, rigid
 
 import rts
@@ -182,7 +183,7 @@ def test_parts_that_nothing_is_seen_of_have_no_row_in_use(shader):
     rows = [np.asarray(own.row).reshape(-1) for own in sampled.samples]
     assert (rows[-1] == -1).all() and int(sampled.overflow) == 0
     starts = np.cumsum([0, *map(len, rows)])
-    named = np.concatenate([np.asarray(sampled.row).reshape(-1), np.asarray(sampled.outlines.rows).reshape(-1)])
+    named = np.concatenate([np.asarray(x).reshape(-1) for x in (sampled.row, *sampled.stencil.samples())])
     for first, own in zip(starts, rows, strict=False):
         here = named[(named >= first) & (named < first + len(own))] - first
         used = own[own >= 0]
@@ -195,13 +196,13 @@ def test_samples_and_breaks_without_room_are_counted(monkeypatch):
     poses, parts = crowd("lambert")
     poses = jax.numpy.asarray(poses)
     counts = [own.ids.shape[0] for own in rts.sample(parts(torch.tensor(np.asarray(poses))), CAMERA, SIZE).samples]
-    whole = rts.sample(parts(torch.tensor(np.asarray(poses))), CAMERA, SIZE)
+    whole, outlines = sampled_with_outlines(parts(torch.tensor(np.asarray(poses))), CAMERA, SIZE)
     cells = np.bincount(np.searchsorted(np.cumsum(counts), np.asarray(whole.row)[np.asarray(whole.row) >= 0], "right"))
     with pytest.warns(rts.errors.InputWarning, match="samples find no room in capacity=50"):
         few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE, capacity=50))(poses))
     assert int(few.overflow) == np.maximum(cells - 50, 0).sum() > 0
     assert np.isfinite(np.asarray(rts.render_samples(few, parts(poses), CAMERA))).all()
-    breaks = whole.outlines.place.shape[0]
+    breaks = len(outlines.place)
     monkeypatch.setattr(of_traced, "most_breaks", lambda grid, capacity: 30)
     told = (
         f"{breaks - 30} breaks of outlines find no room beside 30, .* give the compiled program capacity={4 * breaks}"
@@ -272,7 +273,7 @@ def test_what_no_centre_sees_is_shaded_at_its_own_samples_alone(engine):
         return (rts.render(part, camera, SIZE) ** 2).sum()
 
     sampled = rts.sample(rts.Part(sliver, {"vertices": vertices}, Facing()), camera, SIZE)
-    assert (sampled.row < 0).all() and (sampled.outlines.rows >= 0).any()
+    assert (sampled.row < 0).all() and (sampled.stencil.color_sample >= 0).any()
     assert not sampled.samples[0].at_points and sampled.samples[0].ids.tolist()[0] == [1, 2, 3]
     if engine == "jax jit":
         jax = pytest.importorskip("jax")

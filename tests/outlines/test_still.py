@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from found_outlines import sampled_with_outlines
 from helpers import icosphere
 
 import rts
@@ -83,8 +84,9 @@ def test_half_of_the_samples_beside_outlines_are_left():
 
     part = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES}, "normals")
     near = part.replace(theta={"vertices": (VERTICES * 0.6 + [0.3, 0.2, 0.9]).astype(np.float32)})
-    sampled = rts.sample([part, near], CAMERA, SIZE)
-    seen = [np.count_nonzero(np.asarray(x) >= 0) for x in (sampled.row, sampled.outlines.rows, sampled.outlines.inner)]
+    sampled, outlines = sampled_with_outlines([part, near], CAMERA, SIZE)
+    told = sampled.row, outlines.rows[:, :2], outlines.rows[:, 2:4]
+    seen = [np.count_nonzero(np.asarray(x) >= 0) for x in told]
     assert rows(torch.as_tensor) == sum(seen)
     assert rows(np.asarray) == seen[0] + seen[2]
 

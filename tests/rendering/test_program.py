@@ -134,19 +134,27 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
 
 
 def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
-    """A ball inside the image has as many breaks as segments; one across its border has not."""
+    """A stencil with as many entries of motions as of colours, and others."""
     torch, programs = torch_with_programs(), []
 
     def backend(graph, inputs):
         programs.append(graph)
         return graph
 
-    f, counts = rts.program(lambda s: s.outlines.place.sum() + s.outlines.pull.sum(), backend=backend), []
+    def total(sampled):
+        return (sampled.stencil.color_weight**2).sum() + (sampled.stencil.motion_weight**2).sum()
+
+    f, counts = rts.program(total, backend=backend), []
     for x in (0, 0.1, 0.9):
         sampled = rts.sample(PART.replace(transform=rts.rigid(torch.tensor([0, 0, 0, x, 0, -0.5]))), CAMERA, SIZE)
-        found = sampled.outlines.place.sum() + sampled.outlines.pull.sum()
-        assert f(sampled).item() == pytest.approx(found.item(), rel=1e-5)
-        counts.append(len(sampled.outlines.place) - len(sampled.outlines.pull))
+        stencil = sampled.stencil
+        if x == 0:
+            most = len(stencil.color_cell)
+            names = "motion_cell", "motion_sample", "motion_weight", "motion_colors"
+            stencil = replace(stencil, **{name: getattr(stencil, name)[:most] for name in names})
+            sampled = replace(sampled, stencil=stencil)
+        assert f(sampled).item() == pytest.approx(total(sampled).item(), rel=1e-5)
+        counts.append(len(stencil.color_cell) - len(stencil.motion_cell))
     assert counts[0] == 0 != counts[2] and len(programs) == 1
 
 

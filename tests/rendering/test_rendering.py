@@ -53,7 +53,7 @@ def test_render_is_sample_then_render_samples(target):
     found = rts.render_samples(sampled, part, camera, background=(0.1, 0.2, 0.3))
     np.testing.assert_array_equal(to_numpy(found), image)
     assert image.shape == (*SIZE, 4) and image.dtype == np.float32
-    assert sampled.row.shape[0] == 1 and sampled.outlines is not None
+    assert sampled.row.shape[0] == 1 and sampled.stencil is not None
     sampled = rts.sample(part, camera, SIZE, splatter=None, layers=3)
     assert sampled.row.shape == (3, *(n + 2 * APRON for n in SIZE)) and int(sampled.overflow) == 0
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from cards import SIZE, SQUARE, card, flat, in_pixels, turned, two_colors
+from found_outlines import noted
 from helpers import box, icosphere
 
 import rts
-from rts.splatting.edges import splatter, stack_sides, stacks
-from rts.splatting.edges.splatter import EDGES, FIELDS
-from rts.splatting.edges.stack_sides import SIDES
-from rts.splatting.edges.stacks import CELLS
+from rts.splatting import layers, stencil
+from rts.splatting.layers import LAYERS
+from rts.splatting.stencil import SPLAT
 from rts.testing import OperationConformance
 
 pytestmark = pytest.mark.splatting
@@ -68,93 +68,90 @@ SCENES = {
 KNOWN = {}
 
 
-def operands_of(name, operation):
-    """What an operation, "EDGES", "CELLS" or "SIDES", is given where a scene is drawn."""
-    if (name, operation) not in KNOWN:
+def drawn(name):
+    """What the operations, by name, are given where a scene is drawn; and the outlines that its stencil is made from."""
+    if name not in KNOWN:
         make, camera, size = SCENES[name]
-        known = KNOWN[name, operation] = {}
+        known = {}
 
-        def noted(own, called):
+        def seen(own, called):
             def call(*operands, **params):
                 known.setdefault(own, operands)
                 return called(*operands, **params)
 
             return call
 
-        with pytest.MonkeyPatch.context() as patch:
-            modules = {splatter: ("EDGES", EDGES), stacks: ("CELLS", CELLS), stack_sides: ("SIDES", SIDES)}
-            for module, (own, called) in modules.items():
-                patch.setattr(module, own, noted(own, called))
-            # NumPy has no derivatives, so that it does without SIDES.
-            engine = "torch" if operation == "SIDES" else None
-            rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1, engine=engine)
-    return [np.asarray(x) for x in KNOWN[name, operation][operation]]
+        with pytest.MonkeyPatch.context() as patch, noted() as found:
+            for module, (own, called) in {stencil: ("SPLAT", SPLAT), layers: ("LAYERS", LAYERS)}.items():
+                patch.setattr(module, own, seen(own, called))
+            rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1)
+        KNOWN[name] = known, found[-1][0]
+    return KNOWN[name]
+
+
+def operands_of(name, operation):
+    """What an operation, "SPLAT" or "LAYERS", is given where a scene is drawn."""
+    return [np.asarray(x) for x in drawn(name)[0][operation]]
+
+
+SAMPLE, WEIGHT, COLORS = 5, 6, 10
+"""The places of `color_sample`, `color_weight` and `motion_colors` in the operands of SPLAT."""
 
 
 def unseen():
-    """Cards, beside some of whose breaks nothing is seen."""
-    operands = operands_of("cards", "EDGES")
-    at = 3 + FIELDS.index("rows")
-    rows = operands[at].copy()
-    assert (operands[3 + FIELDS.index("inner")][::3, 0] >= 0).any()
-    rows[::3, 0] = -1
-    operands[at] = rows
+    """Cards, beside some of whose outlines nothing is seen; and with entries of weight 0 at the end."""
+    operands = [x.copy() for x in operands_of("cards", "SPLAT")]
+    assert (operands[SAMPLE] >= 0).all() and (operands[COLORS] >= 0).all(axis=1).any()
+    operands[SAMPLE][::3] = -1
+    operands[COLORS][::3, 0], operands[COLORS][1::3, 1] = -1, -1
+    for weight in (WEIGHT, COLORS - 1):
+        operands[weight][-5:] = 0
     return operands
 
 
-def test_scenes_have_pairs_and_lines_of_crossing_and_slopes():
-    near, pair = 3 + FIELDS.index("near"), 3 + FIELDS.index("pair")
-    assert (operands_of("bodies", "EDGES")[near] == 2).any()
-    assert (operands_of("panes", "EDGES")[near] == 2).any()
-    assert (operands_of("a field", "EDGES")[pair] >= 0).any()
+def test_scenes_have_pairs_and_lines_of_crossing():
+    for name in ("bodies", "panes"):
+        assert (drawn(name)[1].near == 2).any()
+    assert (drawn("a field")[1].rows[:, 4:] >= 0).any()
 
 
-class TestEdges(OperationConformance):
+class TestSplat(OperationConformance):
     @pytest.fixture
     def operation(self):
-        return EDGES
+        return SPLAT
 
     @pytest.fixture(params=[*SCENES, "cards, some sides unseen"])
     def operands(self, request):
-        return unseen() if request.param not in SCENES else operands_of(request.param, "EDGES")
+        return unseen() if request.param not in SCENES else operands_of(request.param, "SPLAT")
 
     @pytest.fixture(params=[0, 3])
     def params(self, request):
         return {"border": request.param}
 
 
-class TestCells(OperationConformance):
+class TestLayers(OperationConformance):
     @pytest.fixture
     def operation(self):
-        return CELLS
+        return LAYERS
 
     @pytest.fixture(params=["panes", "panes, some layers empty", "panes, some of alpha 1"])
     def operands(self, request):
-        positions, rgba, row, joined = operands_of("panes", "CELLS")
+        positions, rgba, row, joined, stacks = operands_of("panes", "LAYERS")
+        assert len(stacks) > 100 and joined.any()
         if request.param == "panes, some of alpha 1":
             rgba = rgba.copy()
             rgba[::2, -1] = 1
         elif request.param != "panes":
-            row = row.copy()
-            row[0, ::3], row[1, :, ::4] = -1, -1
+            row, stacks = row.copy(), stacks.copy()
+            row[0, ::3], row[1, :, ::4], stacks[::4, 0] = -1, -1, -1
             assert ((row[0] < 0) & (row[1] >= 0)).any()
-        return [positions, rgba, row, joined]
+        return [positions, rgba, row, joined, stacks]
 
 
 def test_empty_layers_read_no_sample():
-    positions, rgba, row, joined = operands_of("panes", "CELLS")
-    row = row.copy()
-    row[row == 0] = -1
-    assert (row < 0).any()
+    positions, rgba, row, joined, stacks = operands_of("panes", "LAYERS")
+    row, stacks = row.copy(), stacks.copy()
+    row[row == 0], stacks[stacks == 0] = -1, -1
+    assert (row < 0).any() and (stacks < 0).any()
     rgba = np.concatenate([np.full_like(rgba[:1], np.nan), rgba[1:]])
-    assert np.isfinite(CELLS(positions, rgba, row, joined)).all()
-
-
-class TestSides(OperationConformance):
-    @pytest.fixture
-    def operation(self):
-        return SIDES
-
-    @pytest.fixture
-    def operands(self):
-        return operands_of("panes", "SIDES")
+    assert np.isfinite(LAYERS(positions, rgba, row, joined, stacks)).all()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from cards import SIZE, TWO, covered, flat, in_pixels, turned, two_colors
+from found_outlines import sampled_with_outlines
 from helpers import icosphere, pushed
 
 import rts
@@ -34,9 +35,8 @@ def box(share=True, colors=None):
 
 def seams_of(part, camera=CAMERA, size=(96, 96), **options):
     """The number of breaks between two samples of one surface."""
-    sampled = rts.sample(part, camera, size, **options)
-    rows = np.asarray(sampled.outlines.rows)
-    return int((rows >= 0).all(axis=1).sum())
+    _, outlines = sampled_with_outlines(part, camera, size, **options)
+    return int((outlines.rows[:, :2] >= 0).all(axis=1).sum())
 
 
 def halves(t, alpha=1.0):
@@ -195,7 +195,7 @@ def test_where_breaks_have_no_room_outlines_come_first():
     vertices = vertices * (1 + 0.1 * np.random.default_rng(0).random((len(vertices), 1)))
     vertices, mesh = vertices[faces].reshape(-1, 3).astype(np.float32), np.arange(3 * len(faces)).reshape(-1, 3)
     part = rts.Part(rts.Mesh(mesh), {"vertices": vertices}, "lambert")
-    assert rts.sample(part, CAMERA, size).outlines.place.shape[0] > 8 * sum(size) + 100
+    assert len(sampled_with_outlines(part, CAMERA, size)[1].place) > 8 * sum(size) + 100
 
     @jax.jit
     def drawn(vertices):

@@ -243,26 +243,21 @@ def test_no_gap_leads_from_a_view_to_the_next(monkeypatch):
     place = Picture.of(6, tuple(n + 2 * 2 for n in SIZE))
     assert place.down > 1 and place.across > 1
     assert splats.row.shape[1:] == place.size
-    outlines, (height, width) = to_numpy(splats.outlines), place.view
-    joined = outlines.joined.reshape(2, place.down, height, place.across, width)
+    stencil, (height, width) = to_numpy(splats.stencil), place.view
+    joined = stencil.joined.reshape(2, place.down, height, place.across, width)
     assert joined.any() and not joined[0, ..., -1].any() and not joined[1, :, -1].any()
-    y, x, row = outlines.gap.T
-    assert ((y % height < height - 1) | (row == 1)).all() and ((x % width < width - 1) | (row == 0)).all()
-    assert (outlines.square % place.view < np.array(place.view) - 1).all()
-    # The breaks of a segment, and those along its outline, are of its own view; so are their samples.
-    of_break, of_segment = (
-        x[:, 0] // height * place.across + x[:, 1] // width for x in (outlines.gap, outlines.square)
-    )
-    for ties in (*outlines.ties.T, *outlines.beyond.T):
-        assert (of_break[ties[ties >= 0]] == of_segment[ties >= 0]).all()
     grid = np.arange(place.size[0])[:, None] // height * place.across + np.arange(place.size[1]) // width
     positions = to_numpy(splats.positions)
     of_row = positions[:, 1].astype(int) // height * place.across + positions[:, 0].astype(int) // width
-    for rows in (*outlines.rows.T, *outlines.inner.T):
-        assert (of_row[rows[rows >= 0]] == of_break[rows >= 0]).all()
+    # What an entry weighs is of the view of its cell.
+    assert stencil.stacks is None
+    of_color, of_motion = (grid.reshape(-1)[cells] for cells in (stencil.color_cell, stencil.motion_cell))
+    named = [(of_color, stencil.color_sample), (of_motion, stencil.motion_sample)]
+    for of_cell, rows in named + [(of_motion, colors) for colors in stencil.motion_colors.T]:
+        assert len(np.unique(of_cell[rows >= 0])) == 6
+        assert (of_row[rows[rows >= 0]] == of_cell[rows >= 0]).all()
     covered = to_numpy(splats.row)[0] >= 0
     assert (of_row[to_numpy(splats.row)[0][covered]] == grid[covered]).all()
-    assert len(np.unique(of_break)) == 6
 
 
 def test_views_lie_in_as_many_pictures_as_are_needed(monkeypatch):
