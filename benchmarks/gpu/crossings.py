@@ -95,28 +95,21 @@ def names(crossings: list[Crossing]) -> list[str]:
         if not crossing.bytes or crossing.shape in ((), (1,), (3,), (6,), (4, 4)):
             known.append(NUMBERS)
             continue
-        known.append(ORDER[call][found[call]] if call in ORDER else OF_OPERATIONS.get(call, call[1]))
+        known.append(ORDER[call][found[call]] if call in ORDER else call[1])
         found[call] += 1
     return known
 
 
 NUMBERS = "matrices and single numbers"
 _OF_SAMPLES = ("ids", "barycentrics", "row", "depth", "triangle")
-_OF_BREAKS = ("places of breaks", "gaps", "rows of breaks", "points of breaks", "inner rows", "pairs", "near", "slopes")
-_OF_BREAKS += ("ends", "squares", "ties", "sides of squares", "hubs", "beyond", "corners", "pulls", "joined")
+_OF_STENCIL = ("joined", "cells of colours", "colours", "weights of colours")
+_OF_STENCIL += ("cells of motions", "motions", "weights of motions", "colours of motions")
 ORDER = {
-    ("to the device", "in_engine"): (*_OF_SAMPLES, *_OF_BREAKS),
+    ("to the device", "in_engine"): (*_OF_SAMPLES, *_OF_STENCIL),
     ("to the host", "value_of"): ("vertices",),
     ("to the device", "table_of"): ("faces",),
 }
 """The arrays that cross in a call, in their order, numbers and matrices left out."""
-OF_OPERATIONS = {
-    ("to the host", "__call__"): "operands of the splat",
-    ("to the device", "__call__"): "image",
-    ("to the host", "outside"): "gradient of the image",
-    ("to the device", "outside"): "gradients of samples",
-}
-"""What crosses where operations are computed on the host, by its call; autograd calls from outside the library."""
 
 
 def counted(task: Task, device: str) -> tuple[list[Crossing], dict[str, int]]:

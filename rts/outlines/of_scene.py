@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, is_traced, namespace, stopped, value_of
+from rts.arrays.engines import Context, engine_of, is_traced, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
@@ -51,7 +51,7 @@ def with_outlines(
         InputWarning: a sampler cannot sample single points.
     """
     inputs, real = None, real_of(scene)
-    if all(scene.opaque):
+    if all(scene.opaque) and sampled.row.shape[0] > 1:  # Else the cells stay those of a single part, and cross once.
         sampled = replace(sampled, cells=sampled.cells.first(1))
     if scene.context.engine.differentiates:
         # Functions of surfaces want the arrays that they are given.

@@ -211,9 +211,9 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
 def _pieces(
     outlines: Outlines, s: int, e: int, square: tuple[int, int]
 ) -> list[tuple[np.ndarray, np.ndarray, float, dict[int, float]]]:
-    """The straight pieces, start and end, of the ray from end `e` of a segment; and of the middle of each:
+    """The straight pieces, start and end, of the ray from end `e` of a segment; and two values for the middle of each.
 
-    where it lies between break and corner, 0 to 1, and its motion, as weights of those of breaks.
+    These are where it lies between break and corner, 0 to 1, and its motion, as weights of those of breaks.
     """
     h = int(s + outlines.hub[s])
     first, second = outlines.ties[s, 0], outlines.ties[s, 1] if outlines.ties[s, 1] >= 0 else outlines.ties[s, 0]
@@ -242,7 +242,10 @@ def _pieces(
         for start, end in _cut([points[i], points[i + 1]]):
             t = float(((start + end) / 2 - points[i]) @ way) / length if length else 0.0
             rates = (1 - t) * before + t * behind
-            motion = {int(b): float(rate) for b, rate in zip(pulling, rates, strict=True) if b >= 0}
+            motion: dict[int, float] = defaultdict(float)
+            for b, rate in zip(pulling, rates, strict=True):
+                if b >= 0:  # Of a loop through two breaks each pulls twice.
+                    motion[int(b)] += float(rate)
             found.append((start, end, t if i == 0 else 1.0, motion))
     return found
 

@@ -36,24 +36,25 @@ def bytes_by_name(found):
 
 
 @pytest.mark.thorough
-def test_samples_and_breaks_cross_by_their_sizes(step):
+def test_samples_and_stencils_cross_by_their_sizes(step):
     sums, cells = bytes_by_name(step), (SIDE + 4) ** 2
     assert sums["to the device", "row"] == 4 * cells and not sums["to the host", "row"]
     assert sums["to the device", "joined"] == 2 * cells
-    rows, breaks = sums["to the device", "ids"] // 12, sums["to the device", "near"] // 4
-    assert 0 < rows < cells and 0 < breaks
+    rows = sums["to the device", "ids"] // 12
+    colors, motions = (sums["to the device", f"cells of {kind}"] // 4 for kind in ("colours", "motions"))
+    assert 0 < rows < cells and 0 < colors < motions
     assert sums["to the device", "barycentrics"] == 8 * rows
-    assert sums["to the device", "rows of breaks"] == 8 * breaks and sums["to the device", "slopes"] == 16 * breaks
-    assert not sums["to the host", "vertices"]  # They are prepared.
-    # Operands cross once, for the value and the derivative.
-    assert sums["to the device", "image"] == sums["to the host", "gradient of the image"] == 16 * SIDE**2
-    assert sums["to the device", "gradients of samples"] == 28 * rows
+    for name in ("colours", "weights of colours"):
+        assert sums["to the device", name] == 4 * colors
+    for name, bytes_each in {"motions": 4, "weights of motions": 12, "colours of motions": 8}.items():
+        assert sums["to the device", name] == bytes_each * motions
+    # Vertices are prepared, and images and gradients stay.
+    assert not [crossing for crossing in step if crossing.way == "to the host" and crossing.bytes > 64]
 
 
 @pytest.mark.thorough
 def test_every_crossing_has_a_name_and_faces_cross_once(step):
     known = {name for names in crossings.ORDER.values() for name in names} | {crossings.NUMBERS}
-    known |= set(crossings.OF_OPERATIONS.values())
     assert set(crossings.names(step)) <= known
     assert not bytes_by_name(step)["to the device", "faces"]
     with elsewhere.Device():

@@ -298,7 +298,7 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     weights = place.put(WEIGHTS)
     elsewhere.copies.clear(), elsewhere.waits.clear()
     value, slopes = place.gradient(loss_of(case, weights), tree)
-    # The host gets inputs of samplers, and operands of operations that cross; loops along rays ask whether any goes on.
+    # The host gets inputs of samplers; loops along rays ask whether any goes on.
     assert elsewhere.copies or place.name != "torch-elsewhere"
     assert all(line.endswith((" to_host", " on_host")) for line in elsewhere.copies), elsewhere.copies
     loops = ("_repeated", "_cast_some") if name == "sdf" else ()
@@ -423,7 +423,7 @@ def test_a_target_on_another_device_is_refused_in_one_line(place):
 # ------------------------------------------------------------------------------------------------------ operations
 
 
-def _scaled(crosses, calls):
+def _scaled(calls):
     """The operation x · k of arrays (N, 2) and (2,), which notes the calls of its compiled functions."""
 
     def forward(operands, out):
@@ -444,25 +444,54 @@ def _scaled(crosses, calls):
 
     functions = {"forward": forward, "push": push, "pull": pull}
     return rts.plugin_api.operations.Operation(
-        f"tests.scaled_{crosses}", lambda x, k: x * k, (2, 1), lambda x, k: x, **functions, differentiable=2,
-        crosses=crosses,
-    )  # fmt: skip
+        "tests.scaled", lambda x, k: x * k, (2, 1), lambda x, k: x, **functions, differentiable=2
+    )
 
 
-def test_operations_that_cross_run_their_compiled_functions_for_torch(place):
+def test_operations_on_a_device_run_their_array_code(place):
     x, k = RNG.normal(size=(5, 2)), np.array([2.0, -3.0])
-    for crosses in (False, True):
+    for where, compiled in ((place, place.device == "cpu"), (CPU, True)):
         calls = []
-        scaled = _scaled(crosses, calls)
-        tree = place.put([x, k])
-        value, slopes = place.gradient(lambda t, f=scaled: (f(*t) ** 2).sum(), tree)
-        assert float(place.take(value)) == pytest.approx(((x * k) ** 2).sum(), rel=1e-5)
-        for found, expected in zip(place.take(slopes), (2 * x * k * k, (2 * x * x * k).sum(0)), strict=True):
+        scaled = _scaled(calls)
+        tree = where.put([x, k])
+        value, slopes = where.gradient(lambda t, f=scaled: (f(*t) ** 2).sum(), tree)
+        assert float(where.take(value)) == pytest.approx(((x * k) ** 2).sum(), rel=1e-5)
+        for found, expected in zip(where.take(slopes), (2 * x * k * k, (2 * x * x * k).sum(0)), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-5)
-        _, moved = place.tangent(lambda t, f=scaled: f(*t), tree, place.put([x, k]))
-        np.testing.assert_allclose(place.take(moved), 2 * x * k, rtol=1e-5)
-        compiled = crosses and place.engine == "torch"
+        _, moved = where.tangent(lambda t, f=scaled: f(*t), tree, where.put([x, k]))
+        np.testing.assert_allclose(where.take(moved), 2 * x * k, rtol=1e-5)
         assert set(calls) == ({"forward", "pull", "push"} if compiled else set())
+
+
+@pytest.mark.parametrize("shader", ["silhouette", "lambert"])
+def test_no_positions_and_no_colours_cross_in_a_step(place, shader):
+    """A splat that is computed on the host would copy both there, and their gradients back."""
+    if place.engine == "jax":
+        pytest.skip("copies of jax are not counted")
+    crossings = pytest.importorskip("benchmarks.gpu.crossings")
+    theta = {"vertices": place.put(BALL), "colors": place.put(COLORS)}
+    part = rts.prepare(rts.Part(rts.Mesh(FACES), theta, shader))
+    pose, weights = place.put(np.full(6, 0.05)).requires_grad_(), place.put(WEIGHTS)
+    shapes = []
+
+    class Kept(rts.plugin("splatters", "edges")):
+        def cropped(self, splats):
+            shapes.append((splats.positions.shape, splats.rgba.shape))
+            return super().cropped(splats)
+
+    with crossings.Counted(place.device) as counts:
+        moved = part.replace(transform=rts.rigid(pose))
+        (rts.render(moved, CAMERA, SIZE, splatter=Kept()) * weights).sum().backward()
+    assert np.abs(place.take(pose.grad)).max() > 0.1
+    rows = shapes[0][0][0]
+    assert shapes == [((rows, 3), (rows, 4))] and rows > 30 and rows not in (len(BALL), len(FACES))
+    of_samples = [crossing for crossing in counts.crossings if crossing.shape in ((rows, 3), (rows, 4))]
+    # Indices of corners, from the sampler; its barycentrics cross with them.
+    assert [(one.way, one.line.split()[-1]) for one in of_samples] == [("to the device", "in_engine")]
+    assert (rows, 2) in [crossing.shape for crossing in counts.crossings]
+    height, width = SIZE
+    images = {(height, width, 4), (height * width, 4), (height + 4, width + 4, 4), ((height + 4) * (width + 4), 4)}
+    assert not images & {crossing.shape for crossing in counts.crossings}
 
 
 # ---------------------------------------------------------------------------------- the command for machines with a GPU

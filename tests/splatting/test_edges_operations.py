@@ -69,7 +69,7 @@ KNOWN = {}
 
 
 def drawn(name):
-    """What the operations, by name, are given where a scene is drawn; and the outlines that its stencil is made from."""
+    """What operations, by name, are given where a scene is drawn; and the outlines that its stencil is made from."""
     if name not in KNOWN:
         make, camera, size = SCENES[name]
         known = {}
