@@ -449,10 +449,10 @@ ARRAYS = [
         "render_views edges_views",
     ),
     Defect(
-        "outlines of later views are pulled by those of the first",
+        "outlines of later views move with those of the first",
         "rts/sampling/picture.py",
-        "beyond=of_breaks(whole.beyond)",
-        "beyond=whole.beyond",
+        '"motion_sample": moved("motion_sample")}',
+        '"motion_sample": whole("motion_sample")}',
         "edges_views",
     ),
     Defect(
