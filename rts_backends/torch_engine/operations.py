@@ -33,7 +33,8 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    return _Value.apply(_Call(operation, params), *[x.contiguous() for x in operands])
+    operands = [x.contiguous() for x in operands]
+    return (_Value if transformed() else _Eager).apply(_Call(operation, params), *operands)
 
 
 class _Specifying(threading.local):
@@ -156,19 +157,8 @@ def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
     ]
 
 
-class _Value(torch.autograd.Function):
-    """The value of an operation, by compiled code."""
-
-    @staticmethod
-    def forward(call, *operands):
-        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
-        return torch.from_numpy(out)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.call, *operands = inputs
-        ctx.save_for_backward(*operands)
-        ctx.save_for_forward(*operands)
+class _Derivatives(torch.autograd.Function):
+    """The first derivatives of the value of an operation."""
 
     @staticmethod
     def backward(ctx, *gradients):
@@ -196,6 +186,33 @@ class _Value(torch.autograd.Function):
             varied, fixed = call.split(operands)
             return call.pushed(present, fixed)(*varied, *there)[0]
         return _Push.apply(call, present, *operands, *there)[0]
+
+
+class _Eager(_Derivatives):
+    """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python."""
+
+    @staticmethod
+    def forward(ctx, call, *operands):
+        ctx.call = call
+        ctx.save_for_backward(*operands)
+        ctx.save_for_forward(*operands)
+        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
+        return torch.from_numpy(out)
+
+
+class _Value(_Derivatives):
+    """The value of an operation, by compiled code, also under transforms."""
+
+    @staticmethod
+    def forward(call, *operands):
+        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.call, *operands = inputs
+        ctx.save_for_backward(*operands)
+        ctx.save_for_forward(*operands)
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
