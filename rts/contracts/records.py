@@ -219,14 +219,15 @@ class Stencil:
     """An image as a sparse matrix times colours, and its derivative as another one times motions.
 
         image    of a cell  =  colour of its front sample  +  Σ weight · colour
-        d image  of a cell  =  the same of d colours  +  Σ (weight · d position) (colour − other colour)  −  ∇C · d position
+        d image  of a cell  =  the same of d colours  +  Σ (weight · d position) (colour − other)  −  ∇C · d position
 
     The sums are over entries, which only cells beside outlines have. ∇C, the slope of colours at the cell, is the mean
     of the differences from and to the next cells that are joined to it; the last term is that of its front sample. What
     is multiplied by d position is constant. The weights of a cell, with the 1 of its front sample, are at least 0, and
     their sum is at most 1.
 
-    Entries are sorted by cell. Those of weight 0 at the end have no effect. An index −1 stands for nothing, of colour 0.
+    Entries are sorted by cell. Those of weight 0 at the end have no effect. An index −1 stands for nothing, whose
+    colour is 0.
 
     Attributes:
         joined: (2, H, W) bool: does the surface in front of each cell go on to the next one's, along x and along y? Of

@@ -22,8 +22,8 @@ class Splatter(Plugin):
         layers: the number of layers it reads, from the front; None for all. A `translucent` splatter reads all layers
             where light passes through some part.
         reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
-        reads: "outlines", if it reads `Splats.stencil`: outlines are found for no other; and with it "colors at centers",
-            if colours beside them may be those of centres nearby, which saves samples.
+        reads: "outlines", if it reads `Splats.stencil`: outlines are found for no other; and with it "colors at
+            centers", if colours beside them may be those of centres nearby, which saves samples.
         translucent: a promise that samples behind others show as far as alpha lets light through, in all their layers,
             if `Splats.opaque` is False. Without it an image of translucent samples comes with a `LayersWarning`.
         any_channels: a promise that `image` takes any number of channels at once, alpha last. Without it, it is given

@@ -42,9 +42,10 @@ class Operation:
     """A function of arrays that torch and jax can differentiate, in forward and reverse mode, and to second order.
 
     `forward`, `push` and `pull` compute value and first derivatives if arrays are on the host, and all floats have one
-    dtype, float32 or float64. Otherwise, and for second derivatives, `specification` runs, on any device. Under `vmap` they are called for each item, by several threads perhaps. An operation is called
-    with its operands, and with parameters by name. Parameters are hashable values, not arrays, and are passed to all of
-    its functions but `used`. Their names are not `kept`, `wanted` or `single`, which engines pass themselves.
+    dtype, float32 or float64. Otherwise, and for second derivatives, `specification` runs, on any device. Under `vmap`
+    they are called for each item, by several threads perhaps. An operation is called with its operands, and with
+    parameters by name. Parameters are hashable values, not arrays, and are passed to all of its functions but `used`.
+    Their names are not `kept`, `wanted` or `single`, which engines pass themselves.
 
     `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
     fill `out` and `results` in place.

@@ -84,7 +84,8 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
     Returns the place of the break on the sides.
 
     Args:
-        flux: see `weigh_segments`; filled in for segment s and jump i.
+        flux: (N, 4, 2, 4, 2), to fill for segment s and jump i: for each cell and jump, weights of the motions, along x
+            and y, of the four breaks that pull.
         weight: (N, 4), to fill row n: the areas of the cells' quarters that lie behind the ray, clockwise, but for a
             constant.
         length: (N, 4), to fill row n: the lengths of the ray in the quarters.
@@ -92,7 +93,7 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
         i: the jump.
         n: the row of `weight`.
         side: the side.
-        border: see `weigh_segments`.
+        border: width, in cells, beside borders of pixels in which both have a share.
         ray: (3, 2), the break, a point between, and where the outlines meet.
         rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
         other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
@@ -346,7 +347,7 @@ def _add_areas(
 
 @compiled
 def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
-    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns the new number of entries."""
+    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
     cell_of, sample_of, weight_of, colors_of = motions
     for k in range(4):
         cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
@@ -416,9 +417,7 @@ def _add_squares(
                 if both:
                     other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
                 _fill_ray(leader, s, e, leading, path, pull, ray, rates)
-                at[count] = _weigh_ray(
-                    flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other
-                )
+                at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
                 sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
                 count += 1
         if count > 0:
@@ -585,8 +584,8 @@ def _at(colors, several, color):
 def _sorted_colors(colors, count, fronts, real):
     """Entries of colours by cell, one for each colour of a cell, without those of 0, in the dtype of `real`.
 
-    In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts: regions
-    fill the cell, and of a colour no more is taken than there is.
+    In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts:
+    regions fill the cell, and of a colour no more is taken than there is.
     """
     raw_cell, raw_color, raw_weight, raw_from = colors
     found, first, order = _by_cells(raw_cell, count, fronts.size)

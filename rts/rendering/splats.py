@@ -126,7 +126,10 @@ def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, firs
     if stencil is None:
         return replace(samples, cells=replace(samples.cells, row=every))
     there = xp.any(samples.row >= 0)
-    for named, weights in ((stencil.color_sample, stencil.color_weight), (stencil.motion_sample, stencil.motion_weight)):
+    for named, weights in (
+        (stencil.color_sample, stencil.color_weight),
+        (stencil.motion_sample, stencil.motion_weight),
+    ):
         rows, weights = context.constants(named), context.constants(weights)
         weights = xp.reshape(weights, (rows.shape[0], -1))
         # Entries of weight 0 fill up the room.

@@ -18,7 +18,7 @@ from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Stencil
 from rts.operations.operation import Arrays, Operation, Some
-from rts.splatting.cells import centres, over, unpack
+from rts.splatting.cells import over, unpack
 
 
 def composites(positions: Array, rgba: Array, row: Array, stencil: Stencil) -> tuple[Array, Array, Array]:

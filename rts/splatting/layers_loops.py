@@ -1,4 +1,7 @@
-"""Composites of layers, and their derivatives; see `rts.splatting.layers`. Compiled. Alpha is the last of C channels."""
+"""Composites of layers, and their derivatives, for `rts.splatting.layers`. Compiled.
+
+Alpha is the last of C channels.
+"""
 
 from __future__ import annotations
 

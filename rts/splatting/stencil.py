@@ -1,4 +1,4 @@
-"""The sparse product of a stencil with colours, and its derivative, with motions: see `rts.contracts.records.Stencil`."""
+"""The sparse product of a stencil with colours, and its derivative, with motions; see `Stencil`."""
 
 from __future__ import annotations
 

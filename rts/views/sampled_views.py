@@ -26,7 +26,7 @@ from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.merging import merge
 from rts.sampling.packing import pack_fragments
-from rts.sampling.picture import Picture, stencils_side_by_side, renumbered
+from rts.sampling.picture import Picture, renumbered, stencils_side_by_side
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import in_one_table
