@@ -106,7 +106,7 @@ def cards() -> tuple[list[Any], Any]:
 
 
 def sampled_cards() -> tuple[Any, Any, np.ndarray]:
-    """Samples of the cards; the outlines that their stencil is made of, which nothing hands on; the samples of cells."""
+    """Samples of the cards; the outlines that their stencil is made of, which nothing hands on; and cells."""
     found, whole = [], Outlines.stencil
 
     def stencil(self: Any, starts: np.ndarray, row: np.ndarray, *told: Any) -> Any:

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import rts
+from rts.arrays.engines import context_of
+from rts.contracts.records import Cells, Samples, Stencil
+from rts.rendering.splats import all_in_use
 
 pytestmark = pytest.mark.engines
 
@@ -161,3 +164,39 @@ def test_a_shader_may_ask_whether_an_attribute_is_there():
 
     vertices = jnp.asarray(part.theta["vertices"])
     np.testing.assert_allclose(jax.jit(image)(vertices), image(vertices), rtol=0, atol=1e-6)
+
+
+def stencil_of(colors=(), motions=(), stacks=None):
+    """A stencil of 2 × 2 cells with entries (sample, weight)."""
+    colors, motions = (np.array(x, np.float32).reshape(-1, 2) for x in (colors, motions))
+    of_colors = np.zeros(len(colors), np.int32), colors[:, 0].astype(np.int32), colors[:, 1]
+    cell, sample, pair = (np.zeros((len(motions), *more), np.int32) for more in ((), (), (2,)))
+    sample[:] = motions[:, 0]
+    weight = np.pad(motions[:, 1:], ((0, 0), (2, 0)))
+    stacks = None if stacks is None else np.array(stacks, np.int32).reshape(-1, 2)
+    return Stencil(np.ones((2, 2, 2), bool), *of_colors, cell, sample, weight, pair, stacks)
+
+
+@pytest.mark.parametrize(
+    ("row", "stencil", "used"),
+    [
+        (-1, stencil_of(), False),
+        (4, stencil_of(), True),  # A centre sees the part.
+        (-1, stencil_of(colors=[(4, 0.5)]), True),
+        (-1, stencil_of(colors=[(4, 0.0), (2, 0.5), (6, 0.5)], motions=[(2, 1.0), (6, 1.0)]), False),
+        (-1, stencil_of(motions=[(5, -1.0)]), True),
+        (-1, stencil_of(motions=[(5, 0.0)]), False),
+        # Where light passes through, 4 and 5 are composites: that of the first stack, and of the second.
+        (-1, stencil_of(colors=[(4, 0.5)], stacks=[(2, -1), (3, 4)]), False),
+        (-1, stencil_of(colors=[(5, -0.5)], stacks=[(2, -1), (3, 4)]), True),
+        (-1, stencil_of(colors=[(3, 0.5), (5, 0.0)], stacks=[(2, -1), (3, 4)]), False),
+        (-1, stencil_of(colors=[(3, 0.5)], stacks=[]), False),
+    ],
+)
+def test_a_part_is_in_use_where_a_centre_or_an_entry_that_has_an_effect_names_it(row, stencil, used):
+    """Of samples 3 to 5, those of the part."""
+    like = jnp.zeros(1)
+    cells = Cells(jnp.full((1, 2, 2), -1).at[0, 0, 0].set(row))
+    samples = Samples(jnp.zeros((3, 0), int), jnp.zeros((3, 0)), cells, jnp.int32(0))
+    found = jax.jit(lambda samples, stencil: all_in_use(samples, context_of(like), stencil, 3).row)(samples, stencil)
+    np.testing.assert_array_equal(found, [[[0, 1, 2]]] if used else [[[-1, -1, -1]]])

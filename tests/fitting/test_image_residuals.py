@@ -191,7 +191,7 @@ def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     sweeps = count_sweeps(monkeypatch)
     monkeypatch.setattr(settings, "BAND", 3000)
     found = check(residuals, start(target), 1e-4)
-    assert len(sweeps) == 6 and {len(args[1][2]) for args in sweeps} == {4, 5}  # Rows of unlike number.
+    assert len(sweeps) == 6 and {len(args[6]) for args in sweeps} == {4, 5}  # Rows of unlike number.
     for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=3e-5 * np.abs(b).max())
 

@@ -99,7 +99,9 @@ def test_outputs_are_those_of_renders_one_by_one(engine):
     scene = arrays(engine, [ball, wall])
     together = rts.render(scene, camera, (20, 20), outputs=(*REAL, "part", "triangle"))
     assert list(together) == [*REAL, "part", "triangle"]
-    np.testing.assert_array_equal(to_numpy(together["color"]), to_numpy(rts.render(scene, camera, (20, 20))))
+    # Alone the silhouette needs one sample, whose areas beside outlines are one number: sums are rounded otherwise.
+    alone = to_numpy(rts.render(scene, camera, (20, 20)))
+    np.testing.assert_allclose(to_numpy(together["color"]), alone, rtol=0, atol=5e-7)
     for name in REAL:
         alone = rts.render(scene, camera, (20, 20), outputs=[name])[name]
         np.testing.assert_allclose(to_numpy(together[name]), to_numpy(alone), atol=1e-5)

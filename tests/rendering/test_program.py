@@ -189,7 +189,7 @@ def test_torch_traces_anew_where_a_function_asks_how_many_samples_there_are():
         sampled = rts.sample(PART.replace(transform=rts.rigid(torch.zeros(6))), CAMERA, size)
         # Of one shape of cells, so that nothing else differs.
         (samples_of,), cells = sampled.samples, sampled.cells.map(lambda x: x[..., :8, :8])
-        sampled = replace(sampled, cells=cells, samples=(replace(samples_of, cells=cells),), outlines=None)
+        sampled = replace(sampled, cells=cells, samples=(replace(samples_of, cells=cells),), stencil=None)
         assert f(sampled).item() == pytest.approx(doubled(sampled).item(), rel=1e-5)
         counts.append(len(sampled.samples[0].params))
     assert counts[0] > 100 > counts[1]
