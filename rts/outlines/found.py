@@ -92,7 +92,7 @@ class Outlines(NamedTuple):
             samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays = *of_breaks, *of_segments, self.joined, np.ascontiguousarray(row, np.int32)
+        arrays: Any = *of_breaks, *of_segments, self.joined, np.ascontiguousarray(row, np.int32)
         colors, motions, stacks = loops.entries(*arrays, np.empty(0, real))
         return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
 

@@ -107,7 +107,7 @@ class _Places(NamedTuple):
 
 
 def _joined(
-    centres: Sequence[Samples], beside: Sequence[Samples], used: Sequence[Any]
+    centres: Sequence[Samples], beside: Sequence[Samples], used: Any
 ) -> tuple[tuple[Samples, ...], _Places]:
     """The samples of each part, those at centres and then those beside breaks, of which so many are `used`."""
     samples, counts, firsts, first = [], [], [], 0

@@ -195,7 +195,7 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
             alone = len(ties) == 2 and leaders.count(s + outlines.hub[s]) == 1
             signs = [1 if side < 2 else -1 for side in outlines.square_sides[s]]
             for e, tie in enumerate(ties):
-                for start, end, t, motion in _pieces(outlines, s, e, square):
+                for start, end, t, motion in _pieces(outlines, int(s), e, square):
                     sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
                     share = np.prod(np.where(CORNERS[corner] == 1, sides, 1 - sides))
                     normal = np.array([end[1] - start[1], start[0] - end[0]])

@@ -126,30 +126,19 @@ def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, firs
     if stencil is None:
         return replace(samples, cells=replace(samples.cells, row=every))
     there = xp.any(samples.row >= 0)
-<<<<<<< HEAD
-    for named, weights in (
-        (stencil.color_sample, stencil.color_weight),
-        (stencil.motion_sample, stencil.motion_weight),
-    ):
-        rows, weights = context.constants(named), context.constants(weights)
-        weights = xp.reshape(weights, (rows.shape[0], -1))
-        # Entries of weight 0 fill up the room.
-        there = there | xp.any((rows >= first) & (rows < first + count) & xp.any(weights != 0, axis=1))
-=======
-    stencil = context.constants(stencil)
+    known: Stencil = context.constants(stencil)
     # Entries of weight 0 fill up the room.
-    named = [(stencil.motion_sample, xp.any(stencil.motion_weight != 0, axis=1))]
-    weighed = stencil.color_weight != 0
-    if stencil.stacks is None:
-        named.append((stencil.color_sample, weighed))
-    elif stencil.stacks.shape[0]:  # Colours are composites: of cells, and then of stacks, of which some fill up room.
-        stack = stencil.color_sample - stencil.joined.shape[1] * stencil.joined.shape[2]
-        shares = xp.where((weighed & (stack >= 0))[:, None], xp.abs(stencil.color_weight[:, None]), 0.0)
-        sums = context.engine.segment_sum(shares, xp.clip(stack, 0), stencil.stacks.shape[0])
-        named.append((stencil.stacks, sums > 0))
+    named = [(known.motion_sample, xp.any(known.motion_weight != 0, axis=1))]
+    weighed = known.color_weight != 0
+    if known.stacks is None:
+        named.append((known.color_sample, weighed))
+    elif known.stacks.shape[0]:  # Colours are composites: of cells, and then of stacks, of which some fill up room.
+        stack = known.color_sample - known.joined.shape[1] * known.joined.shape[2]
+        shares = xp.where((weighed & (stack >= 0))[:, None], xp.abs(known.color_weight[:, None]), 0.0)
+        sums = context.engine.segment_sum(shares, xp.clip(stack, 0), known.stacks.shape[0])
+        named.append((known.stacks, sums > 0))
     for rows, counts in named:
         there = there | xp.any((rows >= first) & (rows < first + count) & counts)
->>>>>>> 1b0da454 (Stencils without entries are drawn by programs, and those of glass name stacks, where rows in use are told)
     return replace(samples, cells=replace(samples.cells, row=xp.where(there, every, -1)))
 
 

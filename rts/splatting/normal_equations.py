@@ -28,9 +28,8 @@ def normal_equations(
     from rts.splatting import stencil_loops as loops
 
     (height, width, channels), side = target.shape, (row.shape[0] - 2 * border) // target.shape[0]
-    target, weights, background = (
-        None if x is None else x.reshape(height * width, -1) for x in (target, weights, background)
-    )
+    target = target.reshape(height * width, -1)
+    weights, background = (None if x is None else x.reshape(height * width, -1) for x in (weights, background))
 
     def compared(image: np.ndarray, behind: float, at: Any) -> np.ndarray:
         """The channels of pixels `at` that are compared, over the background; `behind` is 0 for tangents."""

@@ -35,7 +35,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
     samples, counts, moved, cells, start = [], [], [], sampled.cells, 0
-    rows, none = [of.rows.copy() for of in found], np.zeros(len(sampled.samples), np.int32)
+    rows, starts = [of.rows.copy() for of in found], np.zeros(len(sampled.samples), np.int32)
     for part, (samples_of_part, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count, here = samples_of_part.ids.shape[0], [(of.parts == part) & (of.rows >= 0) for of in found]
         beside = np.array([np.count_nonzero(x) for x in here])
@@ -54,7 +54,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)), triangle=None)
     row, real, nowhere = host_value(cells.row), real_of(scenes[0]), np.zeros((len(found), 1), np.int32)
     stencils = [
-        of._replace(rows=at).stencil(none, np.ascontiguousarray(row[:, *place]), told, real)
+        of._replace(rows=at).stencil(starts, np.ascontiguousarray(row[:, *place]), told, real)
         for of, at, place in zip(found, rows, picture.places(), strict=True)
     ]
     joint = stencils_side_by_side(stencils, picture, nowhere, nowhere)
