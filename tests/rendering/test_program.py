@@ -151,7 +151,7 @@ def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
         if x == 0:
             most = len(stencil.color_cell)
             names = "motion_cell", "motion_sample", "motion_weight", "motion_colors"
-            stencil = replace(stencil, **{name: getattr(stencil, name)[:most] for name in names})
+            stencil = replace(stencil, **{name: getattr(stencil, name)[:most].clone() for name in names})
             sampled = replace(sampled, stencil=stencil)
         assert f(sampled).item() == pytest.approx(total(sampled).item(), rel=1e-5)
         counts.append(len(stencil.color_cell) - len(stencil.motion_cell))
