@@ -110,7 +110,8 @@ def test_gradients_at_frozen_samples_are_finite_differences(target):
 def test_images_of_patches_agree(target):
     expected = rts.render(BEZIER, CAMERA, SIZE, layers=3)
     found = rts.render(BEZIER.replace(theta=arrays(target, BEZIER.theta)), CAMERA, SIZE, layers=3)
-    np.testing.assert_allclose(to_numpy(found), expected, rtol=0, atol=3e-5)
+    # Where engines round differently, a break may lie a step of the search, 2⁻¹⁴ of a cell, farther on.
+    np.testing.assert_allclose(to_numpy(found), expected, rtol=0, atol=2**-14)
 
 
 def test_gradients_of_patches_agree_in_torch_and_jax(slopes_by_torch):
