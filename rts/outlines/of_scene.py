@@ -106,9 +106,7 @@ class _Places(NamedTuple):
         return np.append(at, -1).astype(np.int32)
 
 
-def _joined(
-    centres: Sequence[Samples], beside: Sequence[Samples], used: Any
-) -> tuple[tuple[Samples, ...], _Places]:
+def _joined(centres: Sequence[Samples], beside: Sequence[Samples], used: Any) -> tuple[tuple[Samples, ...], _Places]:
     """The samples of each part, those at centres and then those beside breaks, of which so many are `used`."""
     samples, counts, firsts, first = [], [], [], 0
     for of_cells, extra, last in zip(centres, beside, used, strict=True):

@@ -12,6 +12,7 @@ All here is of one layer, without what changes beside breaks as surfaces slide u
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -198,14 +199,19 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
                 for start, end, t, motion in _pieces(outlines, int(s), e, square):
                     sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
                     share = np.prod(np.where(CORNERS[corner] == 1, sides, 1 - sides))
-                    normal = np.array([end[1] - start[1], start[0] - end[0]])
-                    jumps = [(tie, signs[e] * (1 - t / 2 if alone else 1))]
-                    if alone:
-                        jumps.append((ties[1 - e], -signs[1 - e] * t / 2))
-                    for jump, weight in jumps:
-                        for b, rate in motion.items():
-                            found[int(jump), b] += share * weight * rate * normal
+                    normal = share * np.array([end[1] - start[1], start[0] - end[0]])
+                    jumps = {tie: signs[e] * (1 - t / 2 if alone else 1)}
+                    jumps |= {ties[1 - e]: -signs[1 - e] * t / 2} if alone else {}
+                    _add(found, jumps, motion, normal)
     return dict(found)
+
+
+def _add(
+    found: dict[tuple[int, int], np.ndarray], jumps: dict[int, float], motion: dict[int, float], normal: np.ndarray
+) -> None:
+    """Add to fluxes those of a piece, with a normal as long as it: for each pair of a jump and a break that moves it."""
+    for (jump, weight), (b, rate) in itertools.product(jumps.items(), motion.items()):
+        found[int(jump), b] += weight * rate * normal
 
 
 def _pieces(

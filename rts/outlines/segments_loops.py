@@ -100,6 +100,17 @@ def ends_of(gap, place, near, parts, height, width):
     return square[:count], along[:count], ends[:count]
 
 
+@compiled
+def _odd(first, stop, order, ends, e):
+    """True if there is an odd number of ends of the part in front of a crossing e; and of that behind it."""
+    odd_front, odd_back = False, False
+    for m in range(first, stop):
+        if ends[order[m], 2] != 0:
+            odd_front ^= ends[order[m], 3] == ends[e, 3]
+            odd_back ^= ends[order[m], 3] == ends[e, 4]
+    return odd_front, odd_back
+
+
 @loop
 def groups_of(order, square, ends):
     """(E,) int64: which ends of a square may be joined where light passes through: those of one part, and crossings.
@@ -123,11 +134,7 @@ def groups_of(order, square, ends):
             e = order[n]
             kind[n, 0], kind[n, 1] = ends[e, 3], -1
             if ends[e, 2] == 0:
-                odd_front, odd_back = False, False
-                for m in range(first, stop):
-                    if ends[order[m], 2] != 0:
-                        odd_front ^= ends[order[m], 3] == ends[e, 3]
-                        odd_back ^= ends[order[m], 3] == ends[e, 4]
+                odd_front, odd_back = _odd(first, stop, order, ends, e)
                 if odd_front == odd_back:
                     kind[n, 1] = ends[e, 4]
                 elif odd_back:

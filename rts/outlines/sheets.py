@@ -175,7 +175,7 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     if len(vertices) < len(faces):  # Closed meshes have half as many vertices as triangles.
         return faces
-    kept, key = not faces.flags.writeable and faces.flags.owndata, id(faces)
+    key, kept = id(faces), faces.flags.owndata and not faces.flags.writeable
     if kept and key in _welds and _welds[key][0]() is faces:
         _, first, found = _welds[key]
         if len(first) == len(vertices) and np.array_equal(vertices, vertices.take(first, 0)):

@@ -208,6 +208,13 @@ def _behind(start, end, corner):
 
 
 @compiled
+def _lead_on(weight, e, start, end):
+    """Add a straight piece to the way of a ray, whose areas are row `e` of `weight`."""
+    for k in range(4):
+        weight[e, k] += _behind(start, end, k)
+
+
+@compiled
 def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
     """Make one hub of those whose rays alternate around a square, since lines to them cross.
 
@@ -243,8 +250,7 @@ def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
             for e in range(count):
                 if hubs[e] == other:
                     hubs[e] = hub
-                    for k in range(4):
-                        weight[e, k] += _behind(start, end, k)
+                    _lead_on(weight, e, start, end)
             last[hub] = max(last[hub], last[other])
         depth = found + 1
 
@@ -349,26 +355,26 @@ def _add_areas(
 def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
     """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
     cell_of, sample_of, weight_of, colors_of = motions
-    for k in range(4):
+    for j in range(8):
+        k, e = j // 2, j % 2
         cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
-        for e in range(2):
-            tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-            before, behind = shown[tie, 0], shown[tie, 1]
-            for r in range(4):
-                x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
-                b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
-                if b < 0 or before == behind or (x == 0 and y == 0):
+        tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+        before, behind = shown[tie, 0], shown[tie, 1]
+        for r in range(4):
+            x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
+            b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
+            if b < 0 or before == behind or (x == 0 and y == 0):
+                continue
+            for i in range(2):
+                of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
+                of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
+                of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
+                if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
                     continue
-                for i in range(2):
-                    of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
-                    of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
-                    of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
-                    if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
-                        continue
-                    cell_of[m], sample_of[m] = cell, movers[b, i]
-                    weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
-                    colors_of[m, 0], colors_of[m, 1] = before, behind
-                    m += 1
+                cell_of[m], sample_of[m] = cell, movers[b, i]
+                weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
+                colors_of[m, 0], colors_of[m, 1] = before, behind
+                m += 1
     return m
 
 
@@ -485,7 +491,7 @@ def _add_sides(
 
     Of layers each moves by itself: what ends at the break along the normal, others along the gap.
     """
-    normal, width = np.empty((len(gap), 2)), fronts.shape[1]
+    normal, width, cells = np.empty((len(gap), 2)), fronts.shape[1], fronts.size
     _fill_normals(gap, place, ties, normal)
     cell_of, color_of, weight_of, from_of = colors
     for b in range(len(gap)):
@@ -512,26 +518,51 @@ def _add_sides(
                     n += 1
             mine = inside / (length if length > 1e-6 else 1.0)
             across = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
-            if stack.shape[2] == 0:
-                for at, share in ((cell, mine), (next_, 1 - mine)):
-                    m = _add_motion(motions, m, at, rows[b, i], share, across, last, here)
-                    m = _add_motion(motions, m, at, row[0, y, x], share, across, last, here)
+            shares = (cell, mine), (next_, 1 - mine)
+            if stack.shape[2] > 0:
+                along = -0.5 * way * right, -0.5 * way * (1 - right)
+                m, r = _add_layers(b, i, stack, row[:, y, x], here, cells, shares, across, along, stacks, motions, m, r)
                 continue
-            along = -0.5 * way * right, -0.5 * way * (1 - right)
-            for k in range(stack.shape[2]):
-                own, there, stays = row[k, y, x], stack[b, i, k], False
-                if own == there:
-                    continue
-                for other in range(stack.shape[2]):
-                    stays |= stack[b, 1 - i, other] == there
-                for other in range(stack.shape[2]):
-                    stacks[r, other] = row[other, y, x] if other != k else there
-                for at, share in ((cell, mine), (next_, 1 - mine)):
-                    for sample in (own, there):
-                        moves = along if stays else across
-                        m = _add_motion(motions, m, at, sample, share, moves, joined.shape[1] * width + r, here)
-                r += 1
+            for at, share in shares:
+                m = _add_motion(motions, m, at, rows[b, i], share, across, last, here)
+                m = _add_motion(motions, m, at, row[0, y, x], share, across, last, here)
     return n, m, r
+
+
+@compiled
+def _add_layers(b, i, stack, own, here, cells, shares, across, along, stacks, motions, m, r):
+    """Add the entries of motions of layers on a side of a break. Returns the numbers of these, and of stacks.
+
+    The composite of a cell changes as that of a stack where one layer is that of the break.
+
+    Args:
+        b: the break.
+        i: the side.
+        stack: (B, 2, K).
+        own: (K,), the samples of the cell on this side.
+        here: the composite of this cell, which is its number.
+        cells: the number of cells, whose composites come before those of stacks.
+        shares: two cells, and what each has of the change.
+        across: along x and y, by what layers move it that end at the break.
+        along: likewise, of layers that go on.
+        stacks: to fill from `r` on.
+        motions: to fill from `m` on.
+        m: number of entries so far.
+        r: number of stacks so far, after those of breaks.
+    """
+    for k in range(len(own)):
+        there, stays = stack[b, i, k], False
+        if own[k] == there:
+            continue
+        for other in range(len(own)):
+            stays |= stack[b, 1 - i, other] == there
+            stacks[r, other] = own[other] if other != k else there
+        moves = along if stays else across
+        for at, share in shares:
+            m = _add_motion(motions, m, at, own[k], share, moves, cells + r, here)
+            m = _add_motion(motions, m, at, there, share, moves, cells + r, here)
+        r += 1
+    return m, r
 
 
 @compiled(inline="always")

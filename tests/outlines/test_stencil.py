@@ -65,7 +65,7 @@ def test_areas_are_those_of_polygons(number):
 
 @pytest.mark.parametrize("number", quick(OPAQUE))
 def test_fluxes_are_those_of_rays(number):
-    """Of flat parts nothing changes but by jumps at outlines."""
+    """Flat parts change by jumps at outlines alone."""
     whole, outlines, row = mixed(number)
     stencil, front, rng = whole.stencil, row[0], np.random.default_rng(number)
     owners = np.repeat(np.arange(len(whole.samples)), [len(one.ids) for one in whole.samples])

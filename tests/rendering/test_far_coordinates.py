@@ -12,6 +12,8 @@ from rts.errors import InputWarning
 from rts.sampling.sample_checks import checked_proxy
 from rts_surfaces.mesh import Mesh
 
+pytestmark = pytest.mark.rendering
+
 UTM = np.array([5e5, 5e6, 100.0])
 SIZE = (48, 64)
 SAMPLERS = quick(["raster", "reference", "embree", "opengl"], 2)

@@ -9,6 +9,8 @@ from rts.sampling.camera_checks import LARGEST as LARGEST_ENTRY
 from rts.sampling.sample_checks import LARGEST as LARGEST_VERTEX
 from rts_surfaces.mesh import Mesh
 
+pytestmark = pytest.mark.rendering
+
 SIZE = (16, 16)
 CAMERA = rts.Camera.look_at((1, -3, 2), (0, 0, 0), aspect=1.0)
 PART = Mesh.example()
