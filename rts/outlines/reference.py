@@ -209,7 +209,7 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
 def _add(
     found: dict[tuple[int, int], np.ndarray], jumps: dict[int, float], motion: dict[int, float], normal: np.ndarray
 ) -> None:
-    """Add to fluxes those of a piece, with a normal as long as it: for each pair of a jump and a break that moves it."""
+    """Add to fluxes those of a piece, with a normal as long as it, of each pair of a jump and a break."""
     for (jump, weight), (b, rate) in itertools.product(jumps.items(), motion.items()):
         found[int(jump), b] += weight * rate * normal
 

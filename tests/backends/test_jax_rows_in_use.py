@@ -194,7 +194,7 @@ def stencil_of(colors=(), motions=(), stacks=None):
     ],
 )
 def test_a_part_is_in_use_where_a_centre_or_an_entry_that_has_an_effect_names_it(row, stencil, used):
-    """Of samples 3 to 5, those of the part."""
+    """Samples 3 to 5 are those of the part."""
     like = jnp.zeros(1)
     cells = Cells(jnp.full((1, 2, 2), -1).at[0, 0, 0].set(row))
     samples = Samples(jnp.zeros((3, 0), int), jnp.zeros((3, 0)), cells, jnp.int32(0))
