@@ -296,3 +296,25 @@ def test_layers_that_are_found_are_as_many_as_light_goes():
     np.testing.assert_allclose(image[12, 12], over(*[(np.eye(3)[i % 3], 0.3) for i in range(5)]), atol=1e-5)
     with pytest.warns(rts.errors.LayersWarning, match="of the light passes through the last of 2 layers"):
         drawn(parts, layers=2)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0, 0), (0.3, 0.9, 0)])
+def test_a_sheet_of_alpha_one_moves_as_an_opaque_one(direction):
+    """Beside its slanted outline, where its colours change, too: what ends there moves along the outline's normal."""
+    corners, colors = turned(SQUARE, 0.4, (12.2, 11.7)), np.random.default_rng(3).random((4, 3))
+
+    def derivative(opaque):
+        shader = rts.plugin("shaders", "unlit")(opaque=opaque)
+        whole = np.concatenate([colors, np.ones((4, 1))], axis=1).astype(np.float32)
+
+        def scene(t):
+            vertices = torch.tensor(np.column_stack([corners, np.full(4, -3.0)]), dtype=torch.float32)
+            vertices = vertices + t * torch.tensor(direction)
+            return drawn(rts.Part(rts.Mesh(TWO), {"vertices": vertices, "colors": whole}, shader), layers=2)
+
+        return pushed(scene)
+
+    (image, moved), (expected, known) = derivative(False), derivative(True)
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+    np.testing.assert_allclose(moved, known, atol=2e-5)
+    assert np.abs(known[..., :3]).max() > 0.1
