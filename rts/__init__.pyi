@@ -157,7 +157,9 @@ class Mesh(_BuiltInTriangles):
     def vertex_normals(self, vertices: Array) -> Array:
         """Unit normals (V, 3): directions of the area-weighted sums over the faces around each vertex, or zero.
 
-        Those of NumPy vertices are kept until the vertices change.
+        They are zero where there is no area around a vertex, or where its faces nearly cancel, as both sides of a
+        double face do; samples have the normals of their own triangles there. Those of NumPy vertices are kept until
+        the vertices change.
         """
         ...
 

@@ -23,6 +23,10 @@ LOOKED_AT = 4096
 _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
+LARGEST_SIDE = 1 << 20
+"""Pixels along a side of an image, above which nothing is looked at."""
+
+
 def warn_of_coarse_coordinates(
     parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int], context: Context
 ) -> None:
@@ -37,6 +41,8 @@ def warn_of_coarse_coordinates(
         size: (height, width).
         context: the engine that computes, in whose dtype constants are.
     """
+    if max(size) > LARGEST_SIDE:
+        return  # It is refused later: no memory holds such an image.
     for index, part in enumerate(parts):
         surface = part.surface
         if not isinstance(surface, TriangleSurface) or not surface.proxy_is_cheap or surface.depends_on_view:

@@ -76,8 +76,8 @@ def _refuse_large(camera: Camera, transform: np.ndarray | None) -> None:
         sizes["product of the camera's projection and view"] = largest_absolute(camera.projection @ camera.view)
     name = next(name for name, size in sizes.items() if size > LARGEST)
     raise InputError(
-        f"the {name} has an entry of size {sizes[name]:.3g}; expected at most {LARGEST:g}, beyond which places in the "
-        f"image overflow: check how it was made, or choose larger units"
+        f"the {name} has an entry of size {sizes[name]:.3g}; expected at most {LARGEST:g}, "
+        f"beyond which places in the image overflow: check how it was made, or choose larger units"
     )
 
 

@@ -201,8 +201,8 @@ def _check_size(most: float, surface: Any) -> None:
     """Refuse vertices whose largest coordinate is finite, and larger than `LARGEST`."""
     if LARGEST < most < math.inf:
         raise InputError(
-            f"the vertices of {surface!r} reach {most:.3g}; expected at most {LARGEST:g}, beyond which places in the "
-            f"image overflow: check the input, choose larger units, or lower the step size if an optimisation led here"
+            f"the vertices of {surface!r} reach {most:.3g}; expected at most {LARGEST:g}, "
+            f"beyond which places in the image overflow: check the input, choose larger units, or lower the step size if an optimisation led here"
         )
 
 

@@ -507,7 +507,7 @@ class TestTune:
     def test_nothing_is_within(self, modelled, kept):
         with pytest.warns(ToleranceWarning, match="nothing is within 0.0001 %: the least error that was found"):
             tuned = tune(scene("translation"), tolerance=1e-6, samplers=["raster"], truths=kept, **TRUTH)
-        assert tuned.settings["splatter"] == "edges" and tuned.settings["supersample"] == 4
+        assert tuned.settings["splatter"] == "edges" and tuned.settings["supersample"] > 1
         assert tuned.error > 1e-6
 
     def test_bounds_are_no_errors(self, monkeypatch, modelled, kept):

@@ -498,7 +498,7 @@ def test_what_is_no_operation_is_refused_when_it_is_made():
 @pytest.mark.parametrize("value", [None, 7, "abc", [None], np.ones(2), {1}, 0.5], ids=str)
 @pytest.mark.parametrize("name", [field.name for field in fields(Operation) if field.init])
 def test_a_wrong_field_is_one_line_that_names_it(name, value):
-    if (name, repr(value)) in (("used", "None"), ("name", "'abc'")):
+    if (name, repr(value)) in (("used", "None"), ("name", "'abc'"), ("second", "'abc'")):
         pytest.skip("it is a right one")
     with pytest.raises(rts.InputError, match=f"{name}|first" if name != "name" else "named") as refused:
         replace(CLAMP, **{name: value})

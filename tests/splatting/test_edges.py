@@ -177,6 +177,7 @@ def test_jax_draws_what_numpy_draws():
     np.testing.assert_allclose(np.asarray(drawn), edges(two_colors()), atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:second derivatives")
 def test_the_area_of_a_square_that_shifts_has_no_curvature():
     """d² of a pixel's area is 0 but where a corner turns: at most 0.02 px⁻² for each pixel of perimeter."""
     corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))

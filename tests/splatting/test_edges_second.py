@@ -83,7 +83,7 @@ def torch_once():
         return vjp(image, p)[1](jvp(image, (p,), (along,))[1])
 
     def grey_by_hand(p):
-        """Of the grey alone, where the radius has a derivative, too."""
+        """The second derivative of the grey alone, where the radius has a derivative, too."""
         radius, grey = (x.clone().requires_grad_(True) for x in p)
         (slope,) = torch.autograd.grad((disk(radius, grey) ** 2).sum(), grey, create_graph=True)
         return torch.autograd.grad(slope, grey)

@@ -240,7 +240,7 @@ def test_no_gap_leads_from_a_view_to_the_next(monkeypatch):
 
     views("three", torch.tensor(POSE), Kept(), cameras=[*CAMERAS, *CAMERAS[:2]])
     (splats,) = seen
-    place = Picture.of(6, tuple(n + 2 * 2 for n in SIZE))
+    place = Picture.of(6, tuple(n + 2 * 3 for n in SIZE))
     assert place.down > 1 and place.across > 1
     assert splats.row.shape[1:] == place.size
     stencil, (height, width) = to_numpy(splats.stencil), place.view
