@@ -202,7 +202,8 @@ def _check_size(most: float, surface: Any) -> None:
     if LARGEST < most < math.inf:
         raise InputError(
             f"the vertices of {surface!r} reach {most:.3g}; expected at most {LARGEST:g}, "
-            f"beyond which places in the image overflow: check the input, choose larger units, or lower the step size if an optimisation led here"
+            f"beyond which places in the image overflow: check the input, choose larger units, or lower the step size "
+            f"if an optimisation led here"
         )
 
 

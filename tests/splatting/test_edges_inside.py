@@ -42,7 +42,7 @@ def test_white_walls_fill_the_image_whatever_the_order_of_corners(parts):
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_triangles_that_reach_behind_the_camera_are_large(turn):
-    """Of the first wall, one triangle has one corner ahead, and the other has two."""
+    """One triangle of the first wall has one corner ahead, and the other has two."""
     faces = WALLS[:, list(turn)].astype(np.int32)
     sides = Sheets.of(Proxy(CORNERS, faces), CAMERA, SIZE, "none").sides
     np.testing.assert_array_equal(np.abs(sides[:4]), 3)
