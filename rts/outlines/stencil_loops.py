@@ -612,15 +612,15 @@ def _at(colors, several, color):
 
 
 @compiled
-def _sorted_colors(colors, count, fronts, real):
-    """Entries of colours by cell, one for each colour of a cell, without those of 0, in the dtype of `real`.
+def _sorted_colors(colors, count, fronts):
+    """Entries of colours by cell, one for each colour of a cell, without those of 0.
 
     In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts:
     regions fill the cell, and of a colour no more is taken than there is.
     """
     raw_cell, raw_color, raw_weight, raw_from = colors
     found, first, order = _by_cells(raw_cell, count, fronts.size)
-    cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, real.dtype)
+    cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count)
     most = 0
     for i in range(len(found)):
         most = max(most, first[i + 1] - first[i])
@@ -647,12 +647,12 @@ def _sorted_colors(colors, count, fronts, real):
 
 
 @compiled
-def _sorted_motions(motions, count, cells, real):
-    """Entries of motions by cell, in the dtype of `real`."""
+def _sorted_motions(motions, count, cells):
+    """Entries of motions by cell."""
     cell, sample, weight, colors = motions
     _, _, order = _by_cells(cell, count, cells)
     cell_of, sample_of = np.empty(count, np.int32), np.empty(count, np.int32)
-    weight_of, colors_of = np.empty((count, 3), real.dtype), np.empty((count, 2), np.int32)
+    weight_of, colors_of = np.empty((count, 3)), np.empty((count, 2), np.int32)
     for m in range(count):
         entry = order[m]
         cell_of[m], sample_of[m] = cell[entry], sample[entry]
@@ -665,7 +665,7 @@ def _sorted_motions(motions, count, cells, real):
 @loop
 def entries(
     place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
-    joined, row, real,
+    joined, row,
 ):  # fmt: skip
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
@@ -688,7 +688,6 @@ def entries(
         pull: (S, 4).
         joined: (2, H, W).
         row: (K, H, W) int32, the samples in cells.
-        real: (0,), of the dtype of weights.
 
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
@@ -717,5 +716,5 @@ def entries(
     n, m, r = _add_sides(
         place, gap, ends, rows, stack, ties, joined, row, fronts, shown, stacks, colors, motions, n, m, r
     )
-    of_colors, of_motions = _sorted_colors(colors, n, fronts, real), _sorted_motions(motions, m, cells, real)
+    of_colors, of_motions = _sorted_colors(colors, n, fronts), _sorted_motions(motions, m, cells)
     return of_colors, of_motions, stacks[:r]
