@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
 from rts.sampling.entries import is_still
 from rts.sampling.scene import Scene
@@ -92,7 +93,7 @@ class Outlines(NamedTuple):
             samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays: Any = *of_breaks, *of_segments, self.joined, np.ascontiguousarray(row, np.int32)
+        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32))
         (*colors, weight), (*moved, rates, jumps), stacks = loops.entries(*arrays)
         of_colors, of_motions = (*colors, weight.astype(real)), (*moved, rates.astype(real), jumps)
         return Stencil(self.joined, *of_colors, *of_motions, stacks if self.sides.shape[2] else None)
