@@ -94,9 +94,10 @@ class Outlines(NamedTuple):
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
         arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32))
-        (*colors, weight), (*moved, rates, jumps), stacks = loops.entries(*arrays)
-        of_colors, of_motions = (*colors, weight.astype(real)), (*moved, rates.astype(real), jumps)
-        return Stencil(self.joined, *of_colors, *of_motions, stacks if self.sides.shape[2] else None)
+        found: Any = loops.entries(*arrays)
+        (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
+        colors, motions = (cell, sample, weight.astype(real)), (moved_cell, mover, rates.astype(real), jumps)
+        return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
 
     def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
         """The samples (B, 2) that tell motions, and those that tell colours, or −1 for the former.
