@@ -118,6 +118,8 @@ def _coarsest(
         return None
     start, growth = Camera(np.eye(4), local.projection).spread(size)
     pixel = start - growth * seen[inside, 2]
+    if not (pixel > 0).all():
+        return None  # A camera that makes no image is refused later.
     # Only what is beside the axis of the camera moves in the image.
     candidates = (
         ("the vertices of part {} are", points[inside], local.view),

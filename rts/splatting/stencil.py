@@ -66,7 +66,8 @@ def _colors(colors: Array, samples: Array) -> Array:
 def _inside(still: Array, motion: Array, front: Array, joined: Array) -> Array:
     """∇C · m (H, W, C): slopes are means of the differences from and to the next cells of the same surface."""
     xp, color, total = namespace(still), _colors(still, front), 0.0
-    motion = _colors(motion, front)
+    # Composites are no samples, and joined to none.
+    motion = _colors(motion, xp.where(front < motion.shape[0], front, -1))
     for axis in (0, 1):
         rise = xp.where(joined[axis, ..., None], xp.roll(color, -1, axis=1 - axis) - color, 0.0)
         total = total + (rise + xp.roll(rise, 1, axis=1 - axis)) / 2 * motion[..., axis, None]

@@ -37,7 +37,7 @@ def bytes_by_name(found):
 
 @pytest.mark.thorough
 def test_samples_and_stencils_cross_by_their_sizes(step):
-    sums, cells = bytes_by_name(step), (SIDE + 4) ** 2
+    sums, cells = bytes_by_name(step), (SIDE + 6) ** 2
     assert sums["to the device", "row"] == 4 * cells and not sums["to the host", "row"]
     assert sums["to the device", "joined"] == 2 * cells
     rows = sums["to the device", "ids"] // 12

@@ -33,6 +33,11 @@ def mesh(vertices, faces, shader="unlit", color=BLUE, moves=None):
     return rts.Part(rts.Mesh(np.asarray(faces)), theta, shader, cull="none", transform=transform)
 
 
+def in_range(part):
+    """The part, whose shader `depth` shows those of the scene from black to white."""
+    return part.replace(theta={**part.theta, "depth_range": np.float32([2, 5])})
+
+
 def turned(points, x, y=0.0):
     (a, b), (c, d) = (np.cos([x, y]), np.sin([x, y]))
     about_x = np.array([[1, 0, 0], [0, a, -c], [0, c, a]])
@@ -55,8 +60,8 @@ SCENES = {
         mesh(turned(3 * CARD, -1.3) - [0, 0.4, 0], TWO, "lambert", ORANGE),
     ],
     "depth before a wall": lambda t: [
-        mesh(0.5 * SPHERE, FACES, "depth", moves=t),
-        mesh(3 * CARD - [0, 0, 0.8], TWO, "depth"),
+        in_range(mesh(0.5 * SPHERE, FACES, "depth", moves=t)),
+        in_range(mesh(3 * CARD - [0, 0, 0.8], TWO, "depth")),
     ],
     "normals before a wall": lambda t: [
         mesh(0.5 * SPHERE, FACES, "normals", moves=t),

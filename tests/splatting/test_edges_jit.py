@@ -53,6 +53,7 @@ def test_jit_changes_neither_image_nor_derivatives():
 
 
 @thorough
+@pytest.mark.filterwarnings("ignore:second derivatives")
 def test_forward_over_reverse_is_the_same_in_a_program():
     pose, way = jnp.asarray(POSE), jnp.ones(6, jnp.float32)
 
