@@ -122,8 +122,8 @@ class Outlines(NamedTuple):
 
 
 COLORS, MOTIONS = 16, 32
-"""Entries of colours and of motions, for each break, for which programs of fixed shapes have room; about 9 and 15 are
-in use."""
+"""Entries of colours and of motions, for each break, for which programs of fixed shapes have room. Of a ball, a teapot
+and a bunny 3 and 13 are in use; of three balls of glass 5 and 28, for which there is twice the room."""
 
 
 def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
