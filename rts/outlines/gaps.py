@@ -188,8 +188,23 @@ class _Lines(NamedTuple):
         return self.start[gap] + place[:, None] * self.step[gap]
 
 
-def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
-    """The breaks between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there."""
+class Hints(NamedTuple):
+    """Places in gaps where something may be that neither centre sees. Host arrays.
+
+    Attributes:
+        gap: (N, 3) int32, see `Gaps`.
+        place: (N,) float64, between 0 and 1.
+    """
+
+    gap: np.ndarray
+    place: np.ndarray
+
+
+def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> tuple[Breaks, Stacks]:
+    """The breaks between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there.
+
+    Where these centres see the same, a gap is looked at only if it has hints, and at their places first.
+    """
     _, height, width = layers.part.shape
     axis, y, x = np.mgrid[:2, :height, :width].reshape(3, -1)
     gap = np.column_stack([y, x, axis])[(x + axis < width) & (y + 1 - axis < height)].astype(np.int32)
@@ -198,9 +213,15 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
     joined = np.zeros((2, height, width), bool)
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = same & seen
     at = np.flatnonzero(seen & ~(same & _smooth(layers, oracle, *gap.T)))
+    hinted, place = np.empty(0, np.int64), np.empty(0)
+    if hints is not None:
+        hinted, place = _unsearched(hints, gap, at, (height, width))
+    at = np.concatenate([at, np.unique(hinted)])
     gap, gaps = gap[at], _Lines(start[at], step[at])
-    ends = np.arange(len(at)), np.zeros(len(at)), np.ones(len(at))
-    found = _halved(_Intervals(*ends, one.at(at), other.at(at)), gaps, oracle)
+    # Of hints, the numbers of their gaps among these.
+    count = len(at) - len(np.unique(hinted))
+    hinted = count + np.searchsorted(at[count:], hinted)
+    found = _halved(_intervals(count, one.at(at), other.at(at), hinted, place, gaps, oracle), gaps, oracle)
     found = found.at(np.lexsort((found.low, found.gap)))
     number, low, high = found.gap, found.low, found.high
     joined[1 - gap[number, 2], gap[number, 0], gap[number, 1]] = False
@@ -227,6 +248,47 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
         cells_away(change.depth(near), oracle.width),
     )
     return breaks, change.stacks(near, points, beside)
+
+
+def _unsearched(
+    hints: Hints, gap: np.ndarray, searched: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The hints in gaps that are not searched anyway: indices (N,) in `gap` (M, 3), and places (N,), both in order."""
+    number = np.full((2, *size), -1)
+    number[gap[:, 2], gap[:, 0], gap[:, 1]] = np.arange(len(gap))
+    number[gap[searched, 2], gap[searched, 0], gap[searched, 1]] = -1
+    y, x, axis = hints.gap.T
+    index = number[axis, y, x]
+    order = np.lexsort((hints.place, index))
+    order = order[index[order] >= 0]
+    return index[order], hints.place[order]
+
+
+def _intervals(
+    count: int, one: Fronts, other: Fronts, hinted: np.ndarray, place: np.ndarray, gaps: _Lines, oracle: Oracle
+) -> _Intervals:
+    """The intervals to halve: the first `count` gaps, whose ends see `one` and `other`; others between their hints.
+
+    `hinted` (N,) are the gaps of hints, which are at places (N,), in order.
+    """
+    whole = np.arange(count)
+    found = _Intervals(whole, np.zeros(count), np.ones(count), one.at(whole), other.at(whole))
+    if not len(hinted):
+        return found
+    seen = oracle.layers(gaps.points(hinted, place))
+    first, last = np.diff(hinted, prepend=-1) != 0, np.diff(hinted, append=-1) != 0
+    n = np.arange(len(hinted))
+    # What is seen at hints, then at first centres, then at second ones.
+    every = Fronts.of([seen, one.at(hinted), other.at(hinted)])
+    before, ends = np.where(first, len(n) + n, n - 1), np.flatnonzero(last)
+    low = np.where(first, 0.0, np.roll(place, 1))
+    return _Intervals.of(
+        [
+            found,
+            _Intervals(hinted, low, place, every.at(before), seen),
+            _Intervals(hinted[ends], place[ends], np.ones(len(ends)), seen.at(ends), every.at(2 * len(n) + ends)),
+        ]
+    )
 
 
 def cells_away(depth: np.ndarray, width: np.ndarray) -> np.ndarray:

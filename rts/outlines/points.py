@@ -17,7 +17,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import SEAM, Breaks, Fronts, Oracle, find_breaks
+from rts.outlines.gaps import SEAM, Breaks, Fronts, Gaps, Hints, Oracle, find_breaks
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import breaks_of_triangles
@@ -205,7 +205,7 @@ class Points:
             breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width, seams)
         else:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
-            breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
+            breaks, stacks = find_breaks(_lit(layers, opaque), oracle, self._hints(layers))
         if count == 1 or stacks is None:
             # For each break the two last samples, which tell motions, and the two that tell colours.
             points, triangles = np.concatenate([breaks.points, breaks.inner], 1), breaks.triangles
@@ -221,6 +221,35 @@ class Points:
         points = np.concatenate([breaks.points, stacks.points], 1)
         triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
         return breaks, parts, points, triangles, stacks.numbers, stacks.sides
+
+    def _hints(self, layers: Fronts) -> Hints | None:
+        """Places in gaps where triangles are whose silhouettes lie there, though surfaces may be a little beside them.
+
+        Of one layer, silhouettes behind what both centres see do not count.
+        """
+        several: list[Sheets] = []
+        for index, (sampler, camera, entry, sheet) in enumerate(self._parts):
+            if sheet is None and isinstance(sampler, TriangleSampler):
+                host, cull = on_host(camera.for_size(self._grid.size)), self._scene.parts[index].cull
+                sheet = Sheets.of(entry.proxy, entry.proxy.seen_by(host), self._grid.size, cull, index)
+            if sheet is not None and not any(sheet is other for other in several):
+                several.append(sheet)
+        if not several:
+            return None
+        front = Fronts(*(x[0] for x in layers))
+        if len(layers.part) > 1:
+            front = front._replace(part=np.full_like(front.part, -1))
+        met = np.zeros((2, *front.part.shape), np.uint8)
+        for sheet in several:
+            sheet.meet(front, self._width, met)
+        gaps = Gaps.of(met == 2)
+        if not len(gaps.gap):
+            return None
+        found = [sheet.spans(gaps, False)[:2] for sheet in several]
+        names, spans = (np.concatenate(x) for x in zip(*found, strict=True))
+        low, high = np.clip(spans[:, 0], 0, 1), np.clip(spans[:, 1], 0, 1)
+        there = np.flatnonzero((names[:, 0] >= 0) & (high > low))
+        return Hints(gaps.gap[names[there, 0]], (low[there] + high[there]) / 2)
 
     def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""

@@ -1,0 +1,42 @@
+"""Surfaces of patches that are thinner than a pixel, in the image, between their contour and their rim."""
+
+import numpy as np
+import pytest
+from helpers import pushed
+
+import rts
+
+torch = pytest.importorskip("torch")
+
+pytestmark = pytest.mark.sampling
+
+SIZE = (64, 64)
+WHITE = np.ones(3)
+
+
+def tube(taper):
+    """Control points (8, 8, 3) of a tube along z, open at both ends."""
+    z, angle = np.linspace(-1, 1, 8), 2 * np.pi * np.arange(8) / 8
+    radius = 0.5 * (1 + taper * z)[:, None]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z[:, None] + 0 * angle], axis=-1)
+
+
+@pytest.mark.parametrize(("taper", "aside"), [(0.0, 0.6), pytest.param(0.2, 1.0, marks=pytest.mark.thorough)])
+def test_an_open_tube_seen_along_its_axis_is_that_of_its_fine_triangles(taper, aside):
+    """Behind its opening the inside is a crescent, whose ends, where the contour runs into the rim, no centre sees."""
+    points, camera = tube(taper), rts.Camera.look_at((aside, 0.1 * aside, 4), (0, 0, 0), fov_y=25)
+    surface, way = rts.BSpline((8, 8), ("open", "periodic")), np.array([1.0, 0, 0])
+    vertices, faces = surface.tessellate({"points": points}, 24)
+
+    def drawn(surface, name, at):
+        def scene(t):
+            moved = torch.as_tensor(at, dtype=torch.float64) + t * torch.as_tensor(way)
+            part = rts.Part(surface, {name: moved, "color": WHITE}, "silhouette")
+            return rts.render(part, camera, SIZE, splatter="edges")[..., 3]
+
+        return pushed(scene)
+
+    (image, slope), (expected, rate) = drawn(surface, "points", points), drawn(rts.Mesh(faces), "vertices", vertices)
+    # Of the crescent's tip, a line of a third of a pixel and less.
+    assert np.abs(image - expected).max() < 0.08
+    assert np.linalg.norm(slope - rate) < 0.15 * np.linalg.norm(rate)
