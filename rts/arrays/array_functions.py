@@ -169,7 +169,10 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
 
     Quick if it is true.
     """
-    return all([_is_finite(x, below) for x in arrays])
+    for x in arrays:
+        if not _is_finite(x, below):
+            return False
+    return True
 
 
 def _is_finite(x: Array, below: float) -> bool:
@@ -183,7 +186,9 @@ def _is_finite(x: Array, below: float) -> bool:
     from rts.arrays.value_ranges import largest_absolute
 
     # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
-    return largest_absolute(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
+    if 0 in values.strides:
+        values = values[tuple([slice(None) if step else slice(1) for step in values.strides])]
+    return largest_absolute(values) < below
 
 
 def averaged(image: Array, factor: int) -> Array:

@@ -227,12 +227,24 @@ def is_traced(x: Array) -> bool:
 
 def value_of(x: Array) -> np.ndarray | None:
     """The value of an array, or of a list of scalars, as NumPy; None where it is traced."""
+    owner = OWNERS.get(type(x))
+    if owner is not None:
+        return owner.known(x)
     if isinstance(x, CONSTANT_TYPES):
         return np.asarray(x)
     if isinstance(x, (list, tuple)):
         values = [value_of(item) for item in x]
         return None if any(v is None for v in values) else np.array(values)
     return engine_of(x).known(x)
+
+
+def host_value(x: Array) -> np.ndarray:
+    """The value of an array, which is not traced."""
+    if type(x) is np.ndarray:
+        return x
+    value = value_of(x)
+    assert value is not None
+    return value
 
 
 def exemplar(*trees: Tree) -> Array | None:

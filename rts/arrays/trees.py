@@ -124,15 +124,27 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     if kind == _LEAF:
         return fn(tree)
     if kind == _RECORD:
-        arrays, static = split_record(tree)
-        return join_record(type(tree), map_leaves(fn, arrays), static)
+        cls, fields_ = type(tree), tree.__dict__
+        record_, mapped = object.__new__(cls), {}
+        for name in _ARRAY_FIELDS[cls]:
+            item = fields_[name]
+            mapped[name] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
+        for name in STATIC_FIELDS[cls]:
+            mapped[name] = fields_[name]
+        record_.__dict__.update(mapped)
+        return record_
     if kind == _SEQUENCE:
         items = []
         for item in tree:
             items.append(fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item))
-        return type(tree)(*items) if is_named(tree) else type(tree)(items)
+        cls = type(tree)
+        return items if cls is list else (cls(*items) if is_named(tree) else cls(items))
     if kind == _MAPPING:
-        return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
+        mapped = {}
+        for key in sorted(tree):
+            item = tree[key]
+            mapped[key] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
+        return mapped
     return None
 
 

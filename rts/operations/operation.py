@@ -11,7 +11,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import one_line, quoted
 from rts.arrays.array_functions import from_numbers, kind_of
-from rts.arrays.engines import OWNERS, constants, context_of, engine_of, value_of
+from rts.arrays.engines import OWNERS, constants, context_of, engine_of
 from rts.arrays.trees import Array
 from rts.compiling.threads import read_only
 from rts.errors import InputError, InputWarning, RtsError, warn
@@ -27,7 +27,8 @@ def known_value(x: Array) -> np.ndarray | None:
     """The value of an array in the host's memory; None if the array is on another device, or traced."""
     if type(x) is np.ndarray:
         return x
-    return value_of(x) if engine_of(x).on_host(x) else None
+    engine = engine_of(x)
+    return engine.known(x) if engine.on_host(x) else None
 
 
 Arrays = Sequence[np.ndarray]
@@ -242,7 +243,7 @@ class Operation:
             result = self.shape(*shapes, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("shape", shapes, error) from error
-        if type(result) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in result):
+        if type(result) is not tuple or not all([isinstance(n, (int, np.integer)) and n >= 0 for n in result]):
             raise InputError(
                 f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes "
                 f"{_in_words(shapes)}; expected a tuple of integers of at least 0"

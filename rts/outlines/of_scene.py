@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, is_traced, namespace, stopped
+from rts.arrays.engines import Context, engine_of, host_value, is_traced, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
@@ -18,7 +18,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Told, arrays_of, fits, specs
 from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
-from rts.sampling.entries import host_value, inputs_of, is_batched, proxy_inputs
+from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
 from rts.sampling.picture import renumbered
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -79,11 +79,12 @@ def with_outlines(
         row = engine_of(sampled.row).constant(row, sampled.row)
         sampled = replace(sampled, cells=replace(sampled.cells, row=row))
     # Engines that compile eager operations anew for each shape pad them.
-    arrays, layers = arrays_of(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
-    results = engine_of(sampled.row).call_host(lambda _: arrays, specs(0, grid.size, real, layers), sampled.row)
-    overflow = sampled.overflow + np.int32(found.left)
-    cells = replace(sampled.cells, triangle=None)
-    return replace(sampled, samples=samples, cells=cells, stencil=Stencil(*results), overflow=overflow)
+    engine, overflow, cells = engine_of(sampled.row), sampled.overflow + np.int32(found.left), sampled.cells
+    if engine.differentiates:
+        arrays, layers = arrays_of(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
+        stencil = Stencil(*engine.call_host(lambda _: arrays, specs(0, grid.size, real, layers), sampled.row))
+    cells = replace(cells, triangle=None)
+    return replace(sampled, samples=samples, cells=cells, stencil=stencil, overflow=overflow)
 
 
 class _Places(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, exemplar
+from rts.arrays.engines import engine_of, exemplar, host_value
 from rts.arrays.trees import Tree
 from rts.compiling.threads import each
 from rts.contracts.checked_parts import CheckedPart
@@ -24,7 +24,8 @@ from rts.outlines.spans import breaks_of_triangles
 from rts.outlines.stacks import breaks_of_stacks
 from rts.plugin_base import overrides
 from rts.registry import name_of
-from rts.sampling.entries import entry_of, host_value, on_host
+from rts.sampling.camera_checks import on_host
+from rts.sampling.entries import entry_of
 from rts.sampling.joint import Joint
 from rts.sampling.packing import pack_fragments
 from rts.sampling.points import pixel_widths
@@ -64,10 +65,11 @@ def found_in_views(
             continue
         numbers = np.concatenate([one.numbers[here] for one, here in zip(broken, inside, strict=True)])
         one, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
-        ends = np.cumsum([len(x) for x in points])
         samples.append(one)
-        for one, here, number in zip(rows, inside, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
-            one[here] = number
+        first = 0
+        for of_view, here, there in zip(rows, inside, points, strict=True):
+            of_view[here] = numbers[first : first + len(there)]
+            first += len(there)
     return [view.found(one, at, samples) for view, one, at in zip(views, broken, rows, strict=True)], samples
 
 
@@ -145,8 +147,8 @@ class Points:
         if not layered:
             pairs, of_pairs = self._pairs(breaks, samples)
             rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
-        along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
-        place = ((breaks.place - breaks.gap[:, 1::-1] - 0.5) * along).sum(-1)
+        down, across, along = breaks.gap.T
+        place = np.where(along == 1, breaks.place[:, 0] - across, breaks.place[:, 1] - down) - 0.5
         near = np.where(breaks.near == SEAM, 0, breaks.near)  # There both surfaces move alike.
         of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
         return Outlines(rows, parts, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
@@ -161,9 +163,11 @@ class Points:
         if not self._told.motions:
             part[:] = -1
         for index, known in enumerate(self._parts):
+            if not has_pairs(self._scene.parts[index], known[0]):
+                continue
             points, triangles = breaks.points, breaks.triangles
             at = np.flatnonzero(part == index)
-            if not (len(at) and has_pairs(self._scene.parts[index], known[0])):
+            if not len(at):
                 continue
             ending, drawn = (at, breaks.near[at]), isinstance(known[0], TriangleSampler)
             fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None

@@ -84,17 +84,16 @@ def _changes(
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
-    counts, at = np.zeros(count, np.int32), np.zeros(count, np.int64)
-
-    def filled(total: int) -> tuple[np.ndarray, ...]:
-        size = most + 3
+    rows, counts, size, room = np.empty(count, np.int64), np.empty(count, np.int32), most + 3, 2
+    while True:
+        total = room * (len(spans) + 2 * count)
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
-        return np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-
-    known = begins, spans, names, parts, opaque, seen, depth, counts
-    parallel(loops.changes, count, *known, at, False, INNER, *filled(0), work=300 * count)
-    at = np.cumsum(counts) - counts
-    result = filled(int(counts.sum()))
-    parallel(loops.changes, count, *known, at, True, INNER, *result, work=300 * count)
-    whole, place, samples, places, sides = result
+        found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
+        known = begins, spans, names, parts, opaque, seen, depth, rows, counts
+        parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
+        if not (counts < 0).any():
+            break
+        room *= 2  # Many surfaces pass through one another.
+    at = np.repeat(rows - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    whole, place, samples, places, sides = (x.take(at, 0) for x in found)
     return whole, place, samples, places, sides

@@ -346,11 +346,11 @@ def _next_knot(knots, k, known):
 
 @compiled(inline="always")
 def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides):
-    """Find the changes of the stack along a gap, and fill them in if asked to; returns their number.
+    """Fill in the changes of the stack along a gap, as far as there is room; returns their number.
 
-    `numbers` are those of spans, of knots, of runs that are in the stack at first, of the first change, and `fill`.
+    `numbers` are those of spans, of knots, of runs that are in the stack at first, of the first change, and the room.
     """
-    n, known, count, base, fill = numbers
+    n, known, count, base, room = numbers
     found, place, most = 0, 0.0, sides.shape[2]
     for k in range(known):
         for _ in range(count * count):  # Runs that pass through one another before the next knot.
@@ -359,7 +359,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                 break
             place = max(place, there)
             if _seen(stack, m, most, of):
-                if fill:
+                if found < room:
                     change = base, found, 2, m, -1, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
@@ -373,7 +373,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             partner = _index(stack, count, other) if other >= 0 else -1
             m, partner = (partner, m) if 0 <= partner < m else (m, partner)
             if _seen(stack, m, most, of):
-                if fill:
+                if found < room:
                     change = base, found, 0, m, partner, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
@@ -394,7 +394,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                 of[other, INSIDE], count = 1, count + 1
                 m, partner = (m, partner) if partner > m else (partner, m + 1)
             if _seen(stack, m, most, of):
-                if fill:
+                if found < room:
                     change = base, found, 1, m, partner, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
@@ -404,10 +404,10 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
 
 @loop
 def changes(
-    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole,
+    first, last, begins, spans, names, parts, opaque, seen, depth, rows, counts, inner, whole,
     place_of, samples, places, sides,
 ):  # fmt: skip
-    """Count the changes of stacks along gaps, or fill them in, in order.
+    """Fill in the changes of stacks along gaps, in order.
 
     Only those that are seen count: not behind an opaque layer, nor behind the first K.
 
@@ -421,26 +421,27 @@ def changes(
         opaque: bool, for each part.
         seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
         depth: (M, 2, K) float64, their depths.
-        counts: (M,) int32, numbers of changes; to fill if they are counted.
-        at: (M,) where the changes of each gap begin; used if
-        fill: True to fill in what follows, False to count.
+        rows: (M,) int64 to fill: the row of what follows where the changes of each gap begin.
+        counts: (M,) int32 to fill: the number of changes of each gap; −1 where there is no room for them.
         inner: distance of the samples that tell colours of what ends.
-        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
-            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
+        whole: (E, 6) int32 to fill, with a multiple of N + 2 M rows: gap; 0 or 1 where the surface before or behind
+            ends, 2 where two cross; its part, and the part behind it, or those that cross, as before and behind; 1 for
+            the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
         samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
             of the stack there, front to back, with what starts or ends.
         places: (E, 2 + K + 1) to fill: places of these samples.
         sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
     """
-    longest, most_changes = 0, 0
+    longest, each = 0, len(whole) // max(begins[-1] + 2 * len(counts), 1)
+    at, end = each * (begins[first] + 2 * first), each * (begins[last] + 2 * last)
     for g in range(first, last):
-        longest, most_changes = max(longest, begins[g + 1] - begins[g]), max(most_changes, counts[g])
+        longest = max(longest, begins[g + 1] - begins[g])
     own, of = np.empty((longest, 11)), np.empty((longest, 8), np.int64)
     stack, knots = np.empty(longest + 1, np.int64), np.empty(2 * longest + 1)
-    enders = np.empty((most_changes, 2), np.int64)
+    enders = np.empty((end - at, 2), np.int64)
     for g in range(first, last):
-        n, base = begins[g + 1] - begins[g], at[g]
+        n, base = begins[g + 1] - begins[g], at
         for i in range(n):
             x = begins[g] + i
             for c in range(spans.shape[1]):
@@ -453,10 +454,11 @@ def changes(
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))
                 of[i, INSIDE], count = 1, count + 1
-        numbers = n, known, count, base, fill
+        numbers = n, known, count, base, end - base
         found = _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides)
-        if not fill:
-            counts[g] = found
-            continue
+        rows[g], counts[g] = base, found
+        if found > end - base:
+            counts[g], found = -1, 0
         for f in range(found):
             _complete(base, f, found, g, enders, own, of, inner, whole, place_of, samples, places)
+        at += found

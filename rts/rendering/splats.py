@@ -10,7 +10,7 @@ import numpy as np
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats, Stencil
+from rts.contracts.records import ON_RAYS, Cells, Sampled, Samples, Splats, Stencil
 from rts.contracts.result_checks import check_splats
 from rts.errors import InputError
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
@@ -57,11 +57,10 @@ def splats_of(
     sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
 ) -> Splats:
     """The splats of samples with these positions and colours."""
-    cells = replace(sampled.cells, depth=None, triangle=None)
-    stencil = context_of(positions, rgba).constants(sampled.stencil)
+    cells, stencil = Cells(sampled.row), sampled.stencil
     if not context.engine.owns(rgba):
-        cells = context_of(positions, rgba).constants(cells)
-    opaque = all(p.shader.opaque for p in parts)
+        cells, stencil = context_of(positions, rgba).constants((cells, stencil))
+    opaque = all([p.shader.opaque for p in parts])
     return Splats(positions, rgba, cells, border, opaque, stencil)
 
 

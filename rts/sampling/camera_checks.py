@@ -1,4 +1,4 @@
-"""Checks of the cameras that surfaces and samplers get on the host."""
+"""The cameras that surfaces and samplers get on the host, and their checks."""
 
 from __future__ import annotations
 
@@ -7,9 +7,24 @@ import functools
 import numpy as np
 
 from rts.arrays.argument_checks import is_invertible
+from rts.arrays.engines import host_value
+from rts.arrays.trees import Array
 from rts.arrays.value_ranges import largest_absolute
 from rts.errors import InputError
 from rts.scene.camera import Camera
+
+
+def on_host(camera: Camera) -> Camera:
+    """A camera that is not traced, with matrices on the host."""
+    if type(camera.view) is type(camera.projection) is np.ndarray:
+        if camera.view.dtype == camera.projection.dtype == np.float64:
+            return camera
+    return camera.replace(view=_matrix(camera.view), projection=_matrix(camera.projection))
+
+
+def _matrix(x: Array) -> np.ndarray:
+    return np.asarray(host_value(x), np.float64)
+
 
 WELL_CONDITIONED = 1e-6
 """The `_spread` of rows from which on a matrix is far from singular."""

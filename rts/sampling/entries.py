@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import CONSTANT_TYPES, engine_of, is_constant, stopped, value_of
+from rts.arrays.engines import OWNERS, host_value, is_constant, stopped, value_of
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
@@ -20,9 +20,10 @@ from rts.scene.camera import Camera
 def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
     for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
-        shape, value = _probed(x)
-        if value is None or value.ndim != len(shape):
-            return False
+        if type(x) is not np.ndarray:
+            shape, value = _probed(x)
+            if value is None or value.ndim != len(shape):
+                return False
     return True
 
 
@@ -46,25 +47,12 @@ def is_batched(x: Array) -> bool:
 
 def _probed(x: Array) -> tuple[tuple[int, ...], np.ndarray | None]:
     """The shape and the value of an array; on another device, of an empty part of it, so that nothing crosses."""
-    if not isinstance(x, CONSTANT_TYPES) and len(shape_of(x)) and not engine_of(x).on_host(x):
+    engine = OWNERS.get(type(x))
+    if engine is None:
+        return shape_of(x), value_of(x)
+    if len(x.shape) and not engine.on_host(x):
         x = x[:0, ...]
-    return shape_of(x), value_of(x)
-
-
-def host_value(x: Array) -> np.ndarray:
-    """The value of an array, which is not traced."""
-    value = value_of(x)
-    assert value is not None
-    return value
-
-
-def on_host(camera: Camera) -> Camera:
-    """A camera that is not traced, with matrices on the host."""
-    return camera.replace(view=_matrix(camera.view), projection=_matrix(camera.projection))
-
-
-def _matrix(x: Array) -> np.ndarray:
-    return np.asarray(host_value(x), np.float64)
+    return x.shape, engine.known(x)
 
 
 def inputs_of(scene: Scene) -> list[Tree]:

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays.engines import context_of, floating_bits, is_constant, stopped
-from rts.arrays.trees import Array, leaves, map_leaves
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
-from rts.sampling.camera_checks import check_camera
+from rts.sampling.camera_checks import check_camera, on_host
 from rts.sampling.layer_order import rays_of
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -137,22 +137,34 @@ class HostCall:
         places, surface, theta = map_leaves(lambda _: 0.0, self._inputs), self._surface, self._theta
         attributes_of, view = self._attributes, self._bounds.view
 
+        def complete(seen: Sequence[Camera], moved: Sequence[np.ndarray], inputs: Tree, further: Sequence) -> tuple:
+            """Samples with all their tables, and the further results."""
+            cameras = [check_camera(camera, *moved) for camera in seen]
+            found, more = find(cameras, inputs, *further)
+            if ON_RAYS in tables:
+                on_rays = _on_rays(found, cameras[0], view, *further)
+                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
+            return found, {name: _allotted(found.tables[name], spec) for name, spec in tables.items()}, more
+
+        if not self._engine.differentiates:  # All is on the host already.
+            seen = [on_host(camera) for camera in self._cameras]
+            inputs = self._inputs if entry is None else entry.inputs
+            found, filled, more = complete(seen, self._transform, inputs, arrays)
+            cells = Cells(found.row, found.depth)
+            return self._packed(found.ids, found.params, cells, found.overflow, filled, tables), dict(more)
+
         def host(*operands: np.ndarray) -> tuple[Any, ...]:
             it = iter(operands)
             seen = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in range(views)]
             moved = [next(it) for _ in range(moves)]
-            cameras = [check_camera(camera, *moved) for camera in seen]
             further = [next(it) for _ in range(further_ones)]
             inputs = map_leaves(lambda _: next(it), places) if entry is None else entry.inputs
-            found, more = find(cameras, inputs, *further)
+            found, filled, more = complete(seen, moved, inputs, further)
             gbuffer = {} if theta is None else surface.evaluate(theta, found)
-            if ON_RAYS in tables:
-                on_rays = _on_rays(found, cameras[0], view, *further)
-                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
             return (
                 *(found.ids, found.params, found.row, found.depth, found.overflow),
                 *(more[name] for name in beside),
-                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
+                *(filled[name] for name in tables),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes_of.items()),
             )
 
@@ -163,18 +175,30 @@ class HostCall:
         results = iter(self._engine.call_host(OnAllCores(host) if self._concurrent else host, specs, *operands))
         ids, params, row, depth, overflow = islice(results, len(sample_specs))
         more, filled, attributes = (dict(zip(x, results, strict=False)) for x in (beside, tables, self._attributes))
-        found = Samples(
+        return self._packed(ids, params, Cells(row, depth), overflow, filled, tables, attributes), more
+
+    def _packed(
+        self,
+        ids: Array,
+        params: Array,
+        cells: Cells,
+        overflow: Array,
+        filled: Mapping[str, Array],
+        tables: Mapping[str, ArraySpec],
+        attributes: Mapping[str, Array] | None = None,
+    ) -> Samples:
+        """Samples of the part, with the tables of these specs."""
+        return Samples(
             ids,
             params,
-            Cells(row, depth),
+            cells,
             overflow,
             tables=filled,
             gbuffer=None if self._theta is None else attributes,
             gbuffer_names=self._reads,
             centered=self._surface.centered,
-            by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
+            by_sample=tuple([name for name, spec in tables.items() if spec.by_sample]),
         )
-        return found, more
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:

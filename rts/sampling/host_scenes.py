@@ -9,15 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, floating_bits, is_constant, namespace
+from rts.arrays.engines import Context, engine_of, floating_bits, host_value, is_constant, namespace
 from rts.arrays.trees import Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.sampling.camera_checks import check_camera
-from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
+from rts.sampling.camera_checks import check_camera, on_host
+from rts.sampling.entries import entry_of, is_known, proxy_inputs
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.triangle_sampler import TriangleSampler
 

@@ -145,6 +145,8 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
 
     These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
     """
+    if len(scene.parts) < 2:
+        return scene
     suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
     if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)):
         return scene

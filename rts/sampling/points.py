@@ -42,13 +42,19 @@ def at_points(
 
 def pixel_rows(camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """`Camera.pixel_rows` of host matrices, float64."""
-    return np.ascontiguousarray(camera.pixel_rows(size), np.float64)
+    across, down = size[1] / 2, size[0] / 2
+    x, y, _, w = np.asarray(camera.projection, np.float64)
+    return np.array([across * x + across * w, down * w - down * y, w, _BACKWARDS]) @ camera.view
+
+
+_BACKWARDS = np.array([0.0, 0.0, -1.0, 0.0])
+"""Linear depth of points in camera space."""
 
 
 def near_and_far(camera: Camera) -> np.ndarray:
     """(2, 4) near and far plane of host matrices, positive on what is seen."""
     p = camera.projection
-    return np.stack([p[3] + p[2], p[3] - p[2]]) @ camera.view
+    return np.array([p[3] + p[2], p[3] - p[2]]) @ camera.view
 
 
 def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:

@@ -351,9 +351,10 @@ class Camera(CameraConverters):
 
         A mirroring view, or an image upside down, reverses it.
         """
+        if cull != "back":
+            return 0.0
         p = self.projection
-        winding = np.sign(np.linalg.det(self.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-        return -float(winding) if cull == "back" else 0.0
+        return -float(np.sign(np.linalg.det(self.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])))
 
     def turned(self) -> Camera:
         """An equivalent camera that looks along −z, for a camera that looks along +z."""

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import engine_of
+from rts.arrays.engines import engine_of, host_value
 from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
 from rts.outlines.gaps import Fronts
 from rts.outlines.of_scene import real_of
 from rts.outlines.points import Points, at_centres, found_in_views
-from rts.sampling.entries import host_value, inputs_of
+from rts.sampling.entries import inputs_of
 from rts.sampling.picture import stencils_side_by_side
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.views.sampled_views import Sampling, Views, with_counts

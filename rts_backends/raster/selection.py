@@ -61,13 +61,14 @@ def sorted_list(
 
     In `rows`, indices of triangles are replaced by those in the proxy, in place.
     """
-    sums = counts.sum(axis=0)
+    sums = np.add.reduce(counts, axis=0)
     of_bands = sums[::2] + sums[1::2]
-    offsets = np.append(0, np.cumsum(sums))
-    places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
+    offsets = np.zeros(len(sums) + 1, np.int64)
+    np.add.accumulate(sums, out=offsets[1:])
+    places, items = offsets[:-1] + np.add.accumulate(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
         parallel(_sort, len(spans), order, rows, spans, places, items, work=5 * len(items))
-    return TriangleList(keep, np.argsort(-of_bands), offsets, items, rows)
+    return TriangleList(keep, (-of_bands).argsort(), offsets, items, rows)
 
 
 @loop

@@ -18,7 +18,7 @@ from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import array_api, operations, torch_internals
-from rts_backends.torch_engine.functions import foreign, quiet_forward_mode, tangent_alike, transformed
+from rts_backends.torch_engine.functions import is_compiling, quiet_forward_mode, tangent_alike, transformed
 from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
 
 for _cls, _split, _join in Engine.records():
@@ -28,6 +28,9 @@ for _cls, _split, _join in Engine.records():
 _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, torch.uint8, torch.float16, torch.bfloat16}
 """Dtypes of tensors that are taken as they are; others may be complex, or quantized."""
 
+
+_NUMPYS = _REAL - {torch.float16, torch.bfloat16}
+"""Those of these dtypes that tensors keep as NumPy arrays."""
 
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
@@ -109,7 +112,10 @@ class TorchEngine(Engine):
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
         """True if all tensors are in the memory of the host."""
-        return all([x.is_cpu for x in arrays])
+        for x in arrays:
+            if not x.is_cpu:
+                return False
+        return True
 
     def devices(self, arrays: Iterable[Any]) -> set[torch.device]:
         """The devices of the tensors. Single numbers on the CPU count for nothing: torch takes them beside any."""
@@ -147,10 +153,10 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if torch.compiler.is_compiling() or foreign(x):
+        if is_compiling(x) or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
-            return to_host(x)
+            return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)
         return torch_internals.value_within(x, to_host)
 
     def padded(self, x: torch.Tensor) -> bool:

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
@@ -15,11 +14,19 @@ from torch.utils import _pytree
 from rts_backends.torch_engine import torch_internals
 
 
+def is_compiling(x: Tensor) -> bool:
+    """True while `torch.compile` or `torch.export` traces a tensor: the latter traces those of classes of its own."""
+    return torch.compiler.is_dynamo_compiling() if type(x) is Tensor else torch.compiler.is_compiling()
+
+
 def transformed() -> bool:
     """True under a `torch.func` transform, in forward mode, or while `torch.compile` traces."""
-    if torch.compiler.is_compiling() or torch_internals.forward_level() >= 0:
-        return True
-    return torch_internals.current_level() is not None
+    return differentiated() or torch.compiler.is_compiling()
+
+
+def differentiated() -> bool:
+    """True under a `torch.func` transform, or in forward mode."""
+    return torch_internals.current_level() is not None or torch_internals.forward_level() >= 0
 
 
 _loaded: list[bool] = []
@@ -62,12 +69,6 @@ def tangent_alike(x: Tensor) -> Tensor:
     if not x.is_floating_point() or tangent is None or tangent.dtype == x.dtype:
         return x
     return x.to(torch.float64).to(x.dtype)  # One cast alone, to the dtype it has, would be skipped.
-
-
-def on_host(x: Tensor) -> np.ndarray:
-    """The value of a tensor in the memory of the host: a view, or a copy if it is on a device or has no memory."""
-    # Forward mode makes up zeros without memory, which NumPy gets by force alone.
-    return (x if x.is_cpu else x.cpu()).numpy(force=True)
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, foreign, is_zero, on_host, transformed
+from rts_backends.torch_engine.functions import along, differentiated, foreign, is_compiling, is_zero
 from rts_backends.torch_engine.torch_internals import is_asked_for
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
@@ -30,11 +30,11 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
     The array code also runs under `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
+    if not _fits(operands) or _specifying.on or is_compiling(operands[0]):
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
     operands = [x.contiguous() for x in operands]
-    return (_Value if transformed() else _Eager).apply(_Call(operation, params), *operands)
+    return (_Value if differentiated() else _Eager).apply(_Call(operation, params), *operands)
 
 
 class _Specifying(threading.local):
@@ -146,7 +146,15 @@ def _spread(items: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
 
 
 def _host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
-    return [read_only(on_host(t)) for t in tensors]
+    """The values of tensors as loops take them: read-only, and one line after the other."""
+    arrays = []
+    for x in tensors:
+        # Forward mode makes up zeros without memory, which NumPy gets by force alone.
+        array = (x if x.is_cpu else x.cpu()).numpy(force=True)
+        if array.flags.c_contiguous:
+            array.flags.writeable = False  # Of this view of the memory.
+        arrays.append(array if array.flags.c_contiguous else read_only(array))
+    return arrays
 
 
 def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
@@ -167,7 +175,7 @@ class _Derivatives(torch.autograd.Function):
         if foreign(*gradients):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, gradients[0])
-        elif torch.is_grad_enabled() or transformed():
+        elif torch.is_grad_enabled() or differentiated():
             found = _Pull.apply(call, wanted, *operands, gradients[0])
         else:
             found = _Pull.forward(call, wanted, *operands, gradients[0])
