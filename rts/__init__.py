@@ -18,47 +18,52 @@ import importlib
 
 from rts import errors as errors
 from rts import registry
-from rts import regularizers as regularizers
-from rts import results as results
-from rts import shadows as shadows
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_of, namespace
-from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
-from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
-from rts.diagnostics.explain import explain
-from rts.diagnostics.gradient_images import gradient_image
-from rts.diagnostics.gradients import check_gradient
-from rts.diagnostics.notebooks import show
-from rts.diagnostics.profile import profile
 from rts.errors import InputError, RtsError
-from rts.files.images import load_image, save_animation, save_image
-from rts.files.models import load
-from rts.files.moving_models import load_model as load_model
-from rts.files.views.loading import load_views
-from rts.files.views.saving import save_views
-from rts.fitting.fit import fit
-from rts.fitting.image_residuals import ImageResiduals
-from rts.fitting.large_steps import LargeSteps
-from rts.fitting.losses import Loss
-from rts.fitting.schedule import Stage, pyramid
-from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.arguments import Adaptive as Adaptive
 from rts.rendering.image import render, render_samples
-from rts.rendering.program import program
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
-from rts.scene.view import View
-from rts.views.render_views import render_views
+
+_LATER = {
+    "rts.compiling.warmup": "warmup",
+    "rts.contracts.residuals": "Residuals",
+    "rts.diagnostics.explain": "explain",
+    "rts.diagnostics.gradient_images": "gradient_image",
+    "rts.diagnostics.gradients": "check_gradient",
+    "rts.diagnostics.notebooks": "show",
+    "rts.diagnostics.profile": "profile",
+    "rts.files.images": "load_image save_animation save_image",
+    "rts.files.models": "load",
+    "rts.files.moving_models": "load_model",
+    "rts.files.views.loading": "load_views",
+    "rts.files.views.saving": "save_views",
+    "rts.fitting.fit": "fit",
+    "rts.fitting.image_residuals": "ImageResiduals",
+    "rts.fitting.large_steps": "LargeSteps",
+    "rts.fitting.losses": "Loss",
+    "rts.fitting.schedule": "Stage pyramid",
+    "rts.fitting.view_residuals": "ViewResiduals",
+    "rts.rendering.program": "program",
+    "rts.scene.view": "View",
+    "rts.views.render_views": "render_views",
+}
+"""Module → names of `rts` that are imported from there on first use, separated by spaces: a render needs none."""
+
+_PLACES = {name: place for place, names in _LATER.items() for name in names.split()}
+_MODULES = "regularizers", "results", "shadows"
+"""Modules that are attributes of `rts`, too."""
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning EngineError FileWarning InputWarning "
@@ -83,7 +88,12 @@ _GONE = {
 
 
 def __getattr__(name: str):
-    """The built-in surface or function of this name, imported through its entry point on first use."""
+    """The name, imported on first use: built-in surfaces and functions of other packages through entry points."""
+    if name in _MODULES:
+        return importlib.import_module(f"rts.{name}")
+    if name in _PLACES:
+        found = globals()[name] = getattr(importlib.import_module(_PLACES[name]), name)
+        return found
     if name in _GONE:
         raise AttributeError(f"rts.{name} is gone: {_GONE[name]}")
     for place, names in _MOVED.items():
@@ -95,7 +105,7 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *registry.built_in_attributes()})
+    return sorted({*globals(), *_PLACES, *_MODULES, *registry.built_in_attributes()})
 
 
 __version__ = "0.3.0.dev0"

@@ -8,9 +8,7 @@ import numpy as np
 def largest_absolute(x: np.ndarray) -> float:
     """The largest absolute value in an array of floats; 0 if it is empty, NaN if any value is NaN."""
     # Not of |x|, which would be a copy.
-    return float(
-        np.maximum(np.maximum.reduce(x, axis=None, initial=0), -np.minimum.reduce(x, axis=None, initial=0))
-    )
+    return float(np.maximum(np.maximum.reduce(x, axis=None, initial=0), -np.minimum.reduce(x, axis=None, initial=0)))
 
 
 def value_range(x: np.ndarray) -> tuple[int, int]:

@@ -15,6 +15,9 @@ from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import moving_edges, spans_on
 
+ROOM = 2
+"""Changes for each span that there is room for at first: it starts and ends. Where many cross, there is too little."""
+
 
 def breaks_of_stacks(
     layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray, seams: bool
@@ -84,7 +87,7 @@ def _changes(
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
-    rows, counts, size, room = np.empty(count, np.int64), np.empty(count, np.int32), most + 3, 2
+    rows, counts, size, room = np.empty(count, np.int64), np.empty(count, np.int32), most + 3, ROOM
     while True:
         total = room * (len(spans) + 2 * count)
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))

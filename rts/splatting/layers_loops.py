@@ -100,6 +100,15 @@ def _slope(rgba, before, after, g, moved, behind):
     return 0.5 * (change - opacity * behind)
 
 
+@compiled(inline="always")
+def _any(g, m):
+    """True if a row of a gradient is not 0."""
+    found = False
+    for c in range(g.shape[1]):
+        found |= g[m, c] != 0
+    return found
+
+
 @loop
 def pull(rgba, row, joined, stacks, g, g_positions, g_rgba):
     """Add to gradients of samples those of `g` (2 H · W + R, C); empty ones are not wanted."""
@@ -109,6 +118,8 @@ def pull(rgba, row, joined, stacks, g, g_positions, g_rgba):
     for m in range(cells + len(stacks)):
         # What is behind a layer, times the gradient: all that is asked of it.
         behind, moved_behind, moved = 0.0, 0.0, cells + len(stacks) + m
+        if m >= cells and not _any(g, m):  # Of most stacks the composite only tells how colours jump.
+            continue
         for k in range(_weigh(rgba, flat, stacks, m, samples, layers, through) - 1, -1, -1):
             n, light = samples[k], through[k]
             passed, own, own_moved = 1 - rgba[n, alpha], 0.0, 0.0

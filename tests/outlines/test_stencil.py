@@ -10,7 +10,7 @@ from mixed_scenes import mixed_of
 from soups import soup_of
 
 import rts
-from rts.outlines import reference
+from rts.outlines import reference, stacks
 from rts.outlines.stencil_loops import BORDER
 from rts.splatting.layers import composites
 from rts.splatting.stencil import splat
@@ -125,3 +125,34 @@ def test_a_pixel_that_an_edge_halves_has_half_of_each_side():
     stencil, front = (whole := rts.sample(part, camera, (9, 9))).stencil, whole.row[0]
     weights = weights_of(stencil, front).sum(1).reshape(front.shape)[whole.apron :][:9, whole.apron :][:, :9]
     np.testing.assert_allclose(weights, np.repeat([[1, 1, 1, 1, 0.5, 0, 0, 0, 0]], 9, 0), atol=1e-6)
+
+
+class Pane(rts.Shader):
+    """Glass of one colour, θ["color"] (4,)."""
+
+    def __call__(self, theta, gbuffer, camera):
+        return np.broadcast_to(theta["color"], (len(gbuffer["position"]), 4))
+
+
+def test_many_panes_that_cross_in_a_line_need_no_room_that_is_known_before(monkeypatch):
+    """Twenty panes around one upright line pass through one another there, each through all others."""
+    count, vertices, faces = 20, [], []
+    for n in range(count):
+        angle = np.pi * (n + 0.5) / count
+        away = np.array([np.sin(angle), 0, np.cos(angle)])
+        vertices += [-away + [0.02, -1, 0], away + [0.02, -1, 0], away + [0.02, 1, 0], -away + [0.02, 1, 0]]
+        faces += [[4 * n, 4 * n + 1, 4 * n + 2], [4 * n, 4 * n + 2, 4 * n + 3]]
+    theta = {"vertices": np.array(vertices, np.float32), "color": np.array([0.1, 0.05, 0.02, 0.1], np.float32)}
+    part, camera = (
+        rts.Part(rts.Mesh(np.array(faces)), theta, Pane()),
+        rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=20),
+    )
+    found = []
+    for room in (1, 2, 50):
+        monkeypatch.setattr(stacks, "ROOM", room)
+        found.append(rts.sample(part, camera, (8, 8), layers=count).stencil)
+    crossings = count * (count - 1) // 2
+    assert len(found[0].stacks) > 2 * 8 * crossings  # In each line of pixels, and a stack before and behind each.
+    for other in found[1:]:
+        for name in ("color_cell", "color_weight", "motion_cell", "motion_weight", "stacks"):
+            np.testing.assert_array_equal(getattr(found[0], name), getattr(other, name))
