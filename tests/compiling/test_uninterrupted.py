@@ -238,7 +238,7 @@ image = None
 while image is None or interrupts < wanted:
     try:
         rendering = True
-        image = rts.render(part, camera, (40, 50))
+        image = rts.render(part, camera, (40, 50), splatter='single')
         rendering = False
     except KeyboardInterrupt:
         pass
@@ -256,7 +256,10 @@ print(hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(), *counts
 @needs_signals
 @pytest.mark.thorough
 def test_processes_that_begin_with_no_loop_kept_render_though_interrupted(tmp_path):
-    """Two at once, one of which is interrupted twenty times; then one that loads what they keep, interrupted, too."""
+    """Two at once, one of which is interrupted ten times; then one that loads what they keep, interrupted, too.
+
+    By the splatter of fewest loops, since all are compiled twice.
+    """
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "RTS_NUM_THREADS": "2"}
 
     def started(interrupts):
@@ -274,8 +277,8 @@ def test_processes_that_begin_with_no_loop_kept_render_though_interrupted(tmp_pa
             assert not errors and process.returncode == 0, errors
         return [output.split() for output, _ in outputs]
 
-    (image, *_, compiled), (other, *_) = ended(started(20), started(0))
+    (image, *_, compiled), (other, *_) = ended(started(10), started(0))
     assert other == image
     again, hits, compiled = ended(started(5))[0]
-    assert again == image and int(hits) > 20 and int(compiled) == 0
+    assert again == image and int(hits) > 5 and int(compiled) == 0
     assert not list(tmp_path.rglob("*.tmp.*"))
