@@ -13,6 +13,11 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llv
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# Outside of programs jax compiles each operation for each shape: what one worker has compiled, others load.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "build" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
 # The same examples every time, however busy the machine is. `make test-all` asks for many.
 for name, examples in {"few": 10, "many": 60}.items():
     hypothesis.settings.register_profile(name, deadline=None, derandomize=True, max_examples=examples)
