@@ -20,6 +20,9 @@ from rts.scene.camera import Camera
 LOOKED_AT = 4096
 """Triangles of a part of which a corner is looked at, evenly spaced."""
 
+LARGE = 2.0**13
+"""Numbers in which float32 is a thousandth apart: below, the triangles of a costly surface are not made to look at."""
+
 _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
@@ -32,8 +35,7 @@ def warn_of_coarse_coordinates(
 ) -> None:
     """Warn of parts whose places in the image are rounded to more than a pixel, as coordinates are float32.
 
-    Each surface is checked once, while it is not traced. Surfaces whose triangles are costly or depend on the view are
-    left out.
+    Each surface is checked once, while it is not traced; those whose triangles are costly only with numbers of `LARGE`.
 
     Args:
         parts: the parts.
@@ -45,7 +47,7 @@ def warn_of_coarse_coordinates(
         return  # It is refused later: no memory holds such an image.
     for index, part in enumerate(parts):
         surface = part.surface
-        if not isinstance(surface, TriangleSurface) or not surface.proxy_is_cheap or surface.depends_on_view:
+        if not isinstance(surface, TriangleSurface):
             continue
         try:
             if surface in _looked_at:
@@ -64,6 +66,8 @@ def warn_of_coarse_coordinates(
             part.transform is not None and _is_single(transform, context),
             _is_single(camera.view, context),
         ]
+        if not surface.proxy_is_cheap and _largest(known) < LARGE:
+            continue
         found = _coarsest(surface, known, single, size) if any(single) else None
         if found is not None:
             what, largest, apart, pixel = found
@@ -73,6 +77,13 @@ def warn_of_coarse_coordinates(
                 f" in float64, subtract an origin near the part from its vertices and from the camera's eye and target",
                 InputWarning,
             )
+
+
+def _largest(known: Any) -> float:
+    """The largest number of inputs, transform and camera, in NumPy."""
+    inputs, transform, camera = known
+    arrays = [x for x in (*leaves(inputs), transform, camera.view) if np.asarray(x).dtype.kind == "f"]
+    return max(float(np.abs(x).max(initial=0)) for x in arrays)
 
 
 def _is_single(x: Array, context: Context) -> bool:

@@ -39,11 +39,13 @@ def uninterrupted(function: Callable, *args: Any) -> Any:
         finally:
             going.release()
 
+    raised: BaseException | None = None
     try:
         _thread.start_new_thread(call, ())  # `Thread.start` waits for the thread, and could be interrupted there.
     except RuntimeError:  # The system gives no more threads, or Python is about to exit.
         call()
-    raised: BaseException | None = None
+    except BaseException as error:  # Python looks for signals once the thread has started.
+        raised = error
     while not ended:
         try:
             going.acquire()

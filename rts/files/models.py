@@ -140,6 +140,20 @@ def linear(piece: Piece) -> Piece:
     return piece._replace(attributes=attributes, color=color, texture=texture)
 
 
+EXACT = 1e-5
+"""The largest rounding of vertices, as a share of the box around them, at which they become float32."""
+
+
+def _as_exact_as_needed(vertices: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) in float32; in float64, where that has them and float32 is too coarse, as of map coordinates."""
+    largest = np.abs(vertices).max(initial=0)
+    if vertices.dtype == np.float64 and largest < np.finfo(np.float32).max:
+        if np.spacing(np.float32(largest)) > EXACT * np.ptp(vertices, axis=0).max():
+            return vertices
+    with np.errstate(over="ignore"):  # What is too large is refused later.
+        return vertices.astype(np.float32)
+
+
 def part_of(
     path: Path,
     piece: Piece,
@@ -152,7 +166,7 @@ def part_of(
 
     `tally` is told which of its faces are left out or turned over.
     """
-    vertices, faces = piece.vertices.astype(np.float32), piece.faces
+    vertices, faces = _as_exact_as_needed(piece.vertices), piece.faces
     if weld:
         rows, faces = used_rows(vertices, faces)
         vertices, place = welded_rows(rows)

@@ -64,8 +64,9 @@ def wound_alike(
     """The faces without repetitions, those of each patch wound alike; None if that changes nothing.
 
     A patch is what is joined by edges of two faces. One that is wound in different ways, or had faces of both
-    directions, is wound as its outside is, where it is closed, and else as most of its faces are. Patches with one
-    side only, as Möbius's strip, and such that are wound alike, also with the inside out, stay as they are.
+    directions, is wound as its outside is, where it is closed, and else as most of its faces are; as the others are,
+    where these are alike, and few have both directions. Patches with one side only, as Möbius's strip, and such that
+    are wound alike, also with the inside out, stay as they are.
 
     Args:
         vertices: (V, 3) float.
@@ -86,9 +87,13 @@ def wound_alike(
     alike = np.bincount(patch, like_first, count)
     size = np.bincount(patch, minlength=count)
     changed = (alike < size) | (np.bincount(patch, double, count) > 0)
-    sign = np.where(2 * alike >= size, 1.0, -1.0)
     volume = np.bincount(patch, np.where(like_first, 1, -1) * _volumes(vertices, faces[kept], patch, count), count)
+    # Faces of which the file has both directions have no vote.
+    votes = np.bincount(patch, np.where(double, 0, np.where(like_first, 1, -1)), count)
+    agreed = (np.abs(votes) == np.bincount(patch, ~double, count)) & (2 * np.abs(votes) > size)
+    sign = np.where(2 * alike >= size, 1.0, -1.0)
     sign = np.where(closed & (volume != 0), np.sign(volume), sign)
+    sign = np.where(agreed, np.sign(votes), sign)
     turned = changed[patch] & (like_first != (sign > 0)[patch])
     if has_normals:
         turned &= double

@@ -343,7 +343,8 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     finished = []
     while True:
         fine = found.high - found.low <= FINE
-        finished.append(found.at(np.flatnonzero(fine)))
+        # Hints may be as close to one another, where nothing changes.
+        finished.append(found.at(np.flatnonzero(fine & ~_level(found.before, found.behind, oracle).all(0))))
         found = found.at(np.flatnonzero(~fine))
         if not len(found.gap):
             break

@@ -87,16 +87,17 @@ def _changes(
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
-    rows, counts, size, room = np.empty(count, np.int64), np.empty(count, np.int32), most + 3, ROOM
+    rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
+    room = ROOM * (begins + 2 * np.arange(count + 1))
     while True:
-        total = room * (len(spans) + 2 * count)
+        total = int(room[-1])
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        known = begins, spans, names, parts, opaque, seen, depth, rows, counts
+        known = begins, spans, names, parts, opaque, seen, depth, room, rows, counts
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
-        if not (counts < 0).any():
+        if not (rows < 0).any():
             break
-        room *= 2  # Many surfaces pass through one another.
+        room = np.cumsum([0, *counts])  # Many surfaces pass through one another.
     at = np.repeat(rows - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     whole, place, samples, places, sides = (x.take(at, 0) for x in found)
     return whole, place, samples, places, sides

@@ -404,7 +404,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
 
 @loop
 def changes(
-    first, last, begins, spans, names, parts, opaque, seen, depth, rows, counts, inner, whole,
+    first, last, begins, spans, names, parts, opaque, seen, depth, room, rows, counts, inner, whole,
     place_of, samples, places, sides,
 ):  # fmt: skip
     """Fill in the changes of stacks along gaps, in order.
@@ -421,20 +421,19 @@ def changes(
         opaque: bool, for each part.
         seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
         depth: (M, 2, K) float64, their depths.
-        rows: (M,) int64 to fill: the row of what follows where the changes of each gap begin.
-        counts: (M,) int32 to fill: the number of changes of each gap; −1 where there is no room for them.
+        room: (M + 1,) int64, the rows of what follows up to which there is room for the changes of gaps before each.
+        rows: (M,) int64 to fill: the row where the changes of each gap begin; −1 where there is too little room.
+        counts: (M,) int32 to fill: the number of changes of each gap.
         inner: distance of the samples that tell colours of what ends.
-        whole: (E, 6) int32 to fill, with a multiple of N + 2 M rows: gap; 0 or 1 where the surface before or behind
-            ends, 2 where two cross; its part, and the part behind it, or those that cross, as before and behind; 1 for
-            the gap's first, and its last.
+        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
+            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
         samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
             of the stack there, front to back, with what starts or ends.
         places: (E, 2 + K + 1) to fill: places of these samples.
         sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
     """
-    longest, each = 0, len(whole) // max(begins[-1] + 2 * len(counts), 1)
-    at, end = each * (begins[first] + 2 * first), each * (begins[last] + 2 * last)
+    longest, at, end = 0, room[first], room[last]
     for g in range(first, last):
         longest = max(longest, begins[g + 1] - begins[g])
     own, of = np.empty((longest, 11)), np.empty((longest, 8), np.int64)
@@ -458,7 +457,7 @@ def changes(
         found = _found_along(numbers, own, of, stack, knots, enders, whole, place_of, samples, places, sides)
         rows[g], counts[g] = base, found
         if found > end - base:
-            counts[g], found = -1, 0
+            rows[g], found = -1, 0
         for f in range(found):
             _complete(base, f, found, g, enders, own, of, inner, whole, place_of, samples, places)
         at += found

@@ -33,10 +33,10 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
     if getattr(proxy.vertices, "dtype", None) == np.float64:
         _check_size(largest_absolute(proxy.vertices), surface)  # In float32 they may be infinite.
-    origin = _origin(proxy.vertices)
+    faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
+    origin = _origin(proxy.vertices, faces)
     near = proxy.vertices if origin is None else proxy.vertices - origin
     vertices = _table(surface, "vertices", near, (3,), np.float32)
-    faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
     check_faces(Proxy(vertices, faces), surface)
     none = proxy.ids is None and not surface.refines and surface.sample_widths[0] == 0
     ids = np.zeros((len(faces), 0), np.int32) if none else proxy.ids
@@ -70,22 +70,28 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
 FAR = 8.0
 """Vertices are far from the origin if some coordinate is so many times as large as the box of all vertices."""
 LOOKED_AT = 64
-"""Vertices that tell that most meshes are not far from the origin, evenly spaced."""
+"""Triangles of which a corner tells that most meshes are not far from the origin, evenly spaced."""
 
 
-def _origin(vertices: Any) -> np.ndarray | None:
+def _origin(vertices: Any, faces: np.ndarray) -> np.ndarray | None:
     """A point (3,) near vertices (V, 3) of float64 that are `FAR` from the origin, to be subtracted; None for others.
 
-    Its coordinates are multiples of a power of two no smaller than the box of the vertices, so that most meshes in one
-    place get one origin, and vertices that coincide are rounded alike.
+    Vertices that no face has do not count. Its coordinates are multiples of a power of two no smaller than the box of
+    the vertices, so that most meshes in one place get one origin, and vertices that coincide are rounded alike.
     """
-    if getattr(vertices, "dtype", None) != np.float64 or vertices.shape[1:] != (3,) or not len(vertices):
+    if getattr(vertices, "dtype", None) != np.float64 or vertices.shape[1:] != (3,) or not len(faces):
         return None
-    some = vertices[:: -(-len(vertices) // LOOKED_AT)]
-    most = largest_absolute(vertices)
+    some = faces[:: -(-len(faces) // LOOKED_AT), 0]
+    if not 0 <= some.min() <= some.max() < len(vertices):
+        return None  # They are refused later.
+    some, most = vertices[some], largest_absolute(vertices)
     if not np.isfinite(most) or most <= FAR * (some.max(0) - some.min(0)).max():
         return None
-    low, high = vertices.min(0), vertices.max(0)
+    least, last = table_extent(faces)
+    if not 0 <= least <= last < len(vertices):
+        return None
+    used = vertices[faces.reshape(-1)]
+    low, high, most = used.min(0), used.max(0), largest_absolute(used)
     extent = float((high - low).max())
     if most <= FAR * extent:
         return None

@@ -18,7 +18,7 @@ from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import array_api, operations, torch_internals
-from rts_backends.torch_engine.functions import is_compiling, quiet_forward_mode, tangent_alike, transformed
+from rts_backends.torch_engine.functions import quiet_forward_mode, tangent_alike, transformed
 from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
 
 for _cls, _split, _join in Engine.records():
@@ -153,7 +153,7 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if is_compiling(x) or torch_internals.is_legacy_batchedtensor(x):
+        if torch.compiler.is_compiling() or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)

@@ -14,11 +14,6 @@ from torch.utils import _pytree
 from rts_backends.torch_engine import torch_internals
 
 
-def is_compiling(x: Tensor) -> bool:
-    """True while `torch.compile` or `torch.export` traces a tensor: the latter traces those of classes of its own."""
-    return torch.compiler.is_dynamo_compiling() if type(x) is Tensor else torch.compiler.is_compiling()
-
-
 def transformed() -> bool:
     """True under a `torch.func` transform, in forward mode, or while `torch.compile` traces."""
     return differentiated() or torch.compiler.is_compiling()

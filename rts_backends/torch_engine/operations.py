@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, differentiated, foreign, is_compiling, is_zero
+from rts_backends.torch_engine.functions import along, differentiated, foreign, is_zero
 from rts_backends.torch_engine.torch_internals import is_asked_for
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
@@ -30,7 +30,7 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
     The array code also runs under `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operands) or _specifying.on or is_compiling(operands[0]):
+    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
     operands = [x.contiguous() for x in operands]

@@ -82,16 +82,16 @@ def view_of(key: tuple, center: np.ndarray) -> ViewCell:
 
 
 def _power(x: float) -> int:
-    return round(math.log(max(x, 1e-300)) / math.log(STEP))
+    return round(math.log(min(max(x, 1e-300), 1e300)) / math.log(STEP))
 
 
 def _cell(vector: np.ndarray) -> tuple[int, int, int]:
     """The cell of a direction (3,), of any length, on the sides of a cube: whole numbers from −`CELLS` to `CELLS`.
 
-    A direction of length 0 counts as z.
+    A direction of length 0 counts as z, and so does one of numbers too large, which are refused later.
     """
     largest = float(np.abs(vector).max())
-    x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if largest > 0 else (0, 0, CELLS)
+    x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if 0 < largest < math.inf else (0, 0, CELLS)
     return x, y, z
 
 

@@ -174,3 +174,11 @@ def test_what_corners_have_goes_with_them(tmp_path):
     np.testing.assert_array_equal(at[:, :, 0], np.repeat(np.arange(COUNT)[:, None], 3, axis=1))
     wanted = BALL[FACES[at[:, :, 0].astype(int), at[:, :, 1].astype(int)]]
     np.testing.assert_allclose(part.theta["vertices"][part.surface.faces], wanted, atol=1e-6)
+
+
+def test_a_ball_with_the_inside_out_and_a_double_face_keeps_its_sides(tmp_path):
+    part, [said] = loaded(obj(tmp_path, np.concatenate([TURNED, FACES[:1]])))
+    assert f"1 of {COUNT + 1} faces have the corners of another one" in said
+    np.testing.assert_array_equal(np.sort(part.surface.faces, 1), np.sort(TURNED, 1))
+    normals = part.surface.vertex_normals(part.theta["vertices"])
+    np.testing.assert_allclose(normals, -part.theta["vertices"], atol=0.02)

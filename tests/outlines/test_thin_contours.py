@@ -5,6 +5,7 @@ import pytest
 from helpers import pushed
 
 import rts
+from rts.outlines.gaps import Fronts, Hints, Oracle, find_breaks
 
 torch = pytest.importorskip("torch")
 
@@ -40,3 +41,17 @@ def test_an_open_tube_seen_along_its_axis_is_that_of_its_fine_triangles(taper, a
     # Of the crescent's tip, a line of a third of a pixel and less.
     assert np.abs(image - expected).max() < 0.08
     assert np.linalg.norm(slope - rate) < 0.15 * np.linalg.norm(rate)
+
+
+@pytest.mark.parametrize("place", [[0.5], [0.5, 0.5], [0.5, 0.50005], [0.00005], [0.99995]])
+@pytest.mark.parametrize("part", [0, -1])
+def test_nothing_ends_at_hints_where_nothing_changes(place, part):
+    """Hints of neighbouring triangles are close to one another, as intervals are in which something ends."""
+
+    def seen(*shape):
+        return Fronts(np.full(shape, part, np.int32), np.full(shape, -1, np.int32), np.full(shape, 2.0 * (part >= 0)))
+
+    hints = Hints(np.array([[1, 1, 1]] * len(place), np.int32), np.array(place))
+    oracle = Oracle(lambda points: seen(1, len(points)), np.array([0.0, 0.01]))
+    breaks, _ = find_breaks(seen(1, 4, 4), oracle, hints)
+    assert not len(breaks.gap) and breaks.joined[0, 1, 1] == (part >= 0)

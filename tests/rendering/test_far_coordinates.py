@@ -98,13 +98,13 @@ def test_gradient_does_not_depend_on_where_the_scene_is(sampler):
 
 def test_only_far_vertices_have_an_origin():
     """It is near them, and vertices near the origin, and those of float32, stay as they are."""
-    surface, faces = Mesh(FACES), FACES.astype(np.int32)
+    surface = Mesh(FACES)
     for vertices in (VERTICES, VERTICES + 2, (VERTICES + UTM).astype(np.float32)):
         proxy = checked_proxy(surface, vertices, None, SIZE)
         assert proxy.origin is None and np.array_equal(proxy.vertices, vertices.astype(np.float32))
     proxy = checked_proxy(surface, VERTICES + UTM, None, SIZE)
     assert np.abs(proxy.origin - UTM).max() <= 4 and np.abs(proxy.vertices + proxy.origin - UTM - VERTICES).max() < 1e-6
-    one = Proxy(np.tile(UTM, (3, 1)), faces[:0])._replace(ids=None)
+    one = Proxy(np.tile(UTM, (3, 1)), np.array([[0, 1, 2]], np.int32))
     assert checked_proxy(Fixed(one), None, None, SIZE).vertices.max() < 100
 
 
@@ -177,3 +177,30 @@ def test_ordinary_scenes_do_not_warn():
         warnings.simplefilter("error")
         for vertices, faces, transform, camera in scenes:
             rts.render(rts.Part(Mesh(faces), {"vertices": vertices}, "normals", transform), camera, SIZE)
+
+
+def test_vertices_without_a_face_do_not_count():
+    vertices = np.concatenate([VERTICES + UTM, np.zeros((1, 3))])
+    part = rts.Part(Mesh(FACES), {"vertices": VERTICES}, "normals")
+    near = rts.render(part, camera_at(np.zeros(3)), SIZE)
+    far = rts.render(part.replace(theta={"vertices": vertices}), camera_at(UTM), SIZE)
+    assert np.abs(far - near).max() < 1e-4
+
+
+def test_a_file_in_map_coordinates_keeps_them(tmp_path):
+    rows = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in VERTICES + UTM]
+    text = [*rows, *(f"f {a} {b} {c}" for a, b, c in FACES + 1)]
+    (tmp_path / "far.obj").write_text("\n".join(text))
+    (part,) = rts.load(tmp_path / "far.obj")
+    assert part.theta["vertices"].shape == VERTICES.shape
+    near = rts.render(rts.Part(Mesh(FACES), {"vertices": VERTICES}, "normals"), camera_at(np.zeros(3)), SIZE)
+    assert np.abs(rts.render(part.replace(shader="normals"), camera_at(UTM), SIZE) - near).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
+def test_patches_in_float32_far_away_warn(name):
+    part = rts.plugin("rts.surfaces", name).example()
+    key = "vertices" if "vertices" in part.theta else "points"
+    points = (np.asarray(part.theta[key], np.float64) + UTM).astype(np.float32)
+    with pytest.warns(InputWarning, match="in float32, with coordinates up to 5e"):
+        rts.render(part.replace(theta={**part.theta, key: points}), camera_at(UTM), SIZE)

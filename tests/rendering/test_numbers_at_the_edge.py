@@ -78,3 +78,16 @@ def test_large_products_of_projection_and_view_are_refused():
     view[0, 3], projection[0, 0] = 1e10, 1e10
     with pytest.raises(rts.InputError, match="product of the camera's projection and view has an entry of size "):
         rts.render(PART, CAMERA.replace(view=view, projection=projection), SIZE)
+
+
+@pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_large_control_points_are_refused(name, whole):
+    part = rts.plugin("rts.surfaces", name).example()
+    key = "vertices" if "vertices" in part.theta else "points"
+    for size in HUGE:
+        points = np.array(part.theta[key], np.float64)
+        points.reshape(-1)[slice(None) if whole else slice(1)] = size
+        with pytest.raises(rts.InputError):
+            rts.render(part.replace(theta={**part.theta, key: points}), CAMERA, SIZE)

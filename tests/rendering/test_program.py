@@ -232,3 +232,20 @@ def test_an_old_torch_is_refused(monkeypatch):
 def test_what_is_no_function_is_refused():
     with pytest.raises(rts.InputError, match="rts.program was given 3; expected a function"):
         rts.program(3)
+
+
+@pytest.mark.parametrize("closed", ["vertices", "vertices and color"])
+def test_torch_takes_tensors_that_a_function_closes_over(closed):
+    torch = torch_with_programs()
+    vertices = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    mesh, camera = rts.Mesh(np.array([[0, 1, 2]])), rts.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=40)
+    own = torch.tensor([0.2, 0.4, 0.6])
+
+    def drawn(sampled, color):
+        part = rts.Part(mesh, {"vertices": vertices, "color": color if closed == "vertices" else own}, "lambert")
+        return rts.render_samples(sampled, part, camera)
+
+    part = rts.Part(mesh, {"vertices": vertices, "color": own}, "lambert")
+    sampled = rts.sample(part, camera, (12, 12))
+    program = rts.program(drawn, backend="eager")
+    torch.testing.assert_close(program(sampled, own), drawn(sampled, own), atol=1e-6, rtol=0)
