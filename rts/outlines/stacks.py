@@ -97,7 +97,7 @@ def _changes(
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
             break
-        room = np.cumsum([0, *counts])  # Many surfaces pass through one another.
+        room = np.append(0, np.cumsum(counts))  # Many surfaces pass through one another.
     at = np.repeat(rows - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     whole, place, samples, places, sides = (x.take(at, 0) for x in found)
     return whole, place, samples, places, sides
