@@ -19,7 +19,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 # The same examples every time, however busy the machine is. `make test-all` asks for many.
-for name, examples in {"few": 10, "many": 60}.items():
+for name, examples in {"few": 10, "many": 30}.items():
     hypothesis.settings.register_profile(name, deadline=None, derandomize=True, max_examples=examples)
 hypothesis.settings.load_profile("few")
 
