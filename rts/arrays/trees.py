@@ -124,15 +124,13 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     if kind == _LEAF:
         return fn(tree)
     if kind == _RECORD:
-        cls, fields_ = type(tree), tree.__dict__
-        record_, mapped = object.__new__(cls), {}
-        for name in _ARRAY_FIELDS[cls]:
-            item = fields_[name]
-            mapped[name] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
-        for name in STATIC_FIELDS[cls]:
-            mapped[name] = fields_[name]
-        record_.__dict__.update(mapped)
-        return record_
+        copy, values = object.__new__(type(tree)), tree.__dict__
+        for name in _ARRAY_FIELDS[type(tree)]:
+            item = values[name]
+            copy.__dict__[name] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
+        for name in STATIC_FIELDS[type(tree)]:
+            copy.__dict__[name] = values[name]
+        return copy
     if kind == _SEQUENCE:
         items = []
         for item in tree:

@@ -41,7 +41,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     `merge=True` makes them one. θ holds NumPy float32 arrays: "vertices", and where the file has them "uv",
     "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
     are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
-    vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
+    vertex they have an index table of their own, so that moving vertices opens no seams. Vertices are float64 where
+    float32 is too coarse, as of map coordinates, and so is what is rendered. Normals of the file do not
     follow moving vertices: drop them from θ, and smooth ones are computed that do; likewise "tangents". The shader is
     `pbr` where the material of a glTF or MTL tells more than its base colour: θ then has "metallic", "roughness",
     "normal_map", "occlusion" and "emissive", as far as the file has them, and "uv_occlusion" or the like where a map
@@ -146,9 +147,9 @@ EXACT = 1e-5
 
 def _as_exact_as_needed(vertices: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) in float32; in float64, where that has them and float32 is too coarse, as of map coordinates."""
-    largest = np.abs(vertices).max(initial=0)
-    if vertices.dtype == np.float64 and largest < np.finfo(np.float32).max:
-        if np.spacing(np.float32(largest)) > EXACT * np.ptp(vertices, axis=0).max():
+    if vertices.dtype == np.float64 and len(vertices):
+        largest, extent = np.abs(vertices).max(), np.ptp(vertices, axis=0).max()
+        if largest < np.finfo(np.float32).max and np.spacing(np.float32(largest)) > EXACT * extent > 0:
             return vertices
     with np.errstate(over="ignore"):  # What is too large is refused later.
         return vertices.astype(np.float32)

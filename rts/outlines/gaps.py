@@ -216,11 +216,9 @@ def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> t
     hinted, place = np.empty(0, np.int64), np.empty(0)
     if hints is not None:
         hinted, place = _unsearched(hints, gap, at, (height, width))
-    at = np.concatenate([at, np.unique(hinted)])
+    count, further = len(at), np.unique(hinted)
+    at, hinted = np.concatenate([at, further]), count + np.searchsorted(further, hinted)
     gap, gaps = gap[at], _Lines(start[at], step[at])
-    # Of hints, the numbers of their gaps among these.
-    count = len(at) - len(np.unique(hinted))
-    hinted = count + np.searchsorted(at[count:], hinted)
     found = _halved(_intervals(count, one.at(at), other.at(at), hinted, place, gaps, oracle), gaps, oracle)
     found = found.at(np.lexsort((found.low, found.gap)))
     number, low, high = found.gap, found.low, found.high

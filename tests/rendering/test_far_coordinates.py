@@ -204,3 +204,11 @@ def test_patches_in_float32_far_away_warn(name):
     points = (np.asarray(part.theta[key], np.float64) + UTM).astype(np.float32)
     with pytest.warns(InputWarning, match="in float32, with coordinates up to 5e"):
         rts.render(part.replace(theta={**part.theta, key: points}), camera_at(UTM), SIZE)
+
+
+@pytest.mark.parametrize("place", [0.0, 1.0, 50.0])
+def test_ordinary_files_are_float32(place, tmp_path):
+    rows = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in VERTICES + place]
+    (tmp_path / "near.obj").write_text("\n".join([*rows, *(f"f {a} {b} {c}" for a, b, c in FACES + 1)]))
+    (part,) = rts.load(tmp_path / "near.obj")
+    assert part.theta["vertices"].dtype == np.float32
