@@ -456,10 +456,10 @@ ARRAYS = [
         "edges_views",
     ),
     Defect(
-        "samples beside breaks of all views lie behind the last",
-        "rts/views/outlines.py",
-        "counts = np.stack([cells, beside])\n",
-        "counts = np.stack([cells, beside[::-1]])\n",
+        "cells of later views show samples of the first",
+        "rts/views/sampled_views.py",
+        "- total + starts - first_rows",
+        "- total - first_rows",
         "edges_views",
     ),
 ]

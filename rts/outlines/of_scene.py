@@ -17,7 +17,7 @@ from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Told, arrays_of, fits, specs
-from rts.outlines.points import Points, at_centres, found_in_views, has_pairs
+from rts.outlines.points import Points, at_centres, has_pairs
 from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
 from rts.sampling.picture import renumbered
@@ -68,7 +68,7 @@ def with_outlines(
     cells = map_leaves(host_value, sampled.cells)
     centres = at_centres(cells, sampled.samples)
     while True:
-        (found,), more = found_in_views([points], [centres], count)
+        found, more = points.outlines(centres, count)
         samples, places = _joined(sampled.samples, more, found.beside(len(more)))
         row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
         stencil = found.stencil(places.beside, row, told, real)
@@ -172,7 +172,7 @@ def _found_on_host(
         points = Points.of(here, Grid(camera, grid.size), [x for *_, x in of_parts], told)
         centres, count = at_centres(cells, sampled.samples), most
         while True:
-            (found,), more = found_in_views([points], [centres], count)
+            found, more = points.outlines(centres, count)
             stencil = found.stencil(beside, cells.row, told, real)
             if not count or (fits(stencil, most) and all(own.holds(x) for own, x in zip(room, more, strict=True))):
                 break

@@ -10,7 +10,6 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, exemplar, host_value
 from rts.arrays.trees import Tree
-from rts.compiling.threads import each
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
@@ -26,7 +25,6 @@ from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.sampling.camera_checks import on_host
 from rts.sampling.entries import entry_of
-from rts.sampling.joint import Joint
 from rts.sampling.packing import pack_fragments
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
@@ -34,43 +32,6 @@ from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-
-
-def found_in_views(
-    views: Sequence[Points], layers: Sequence[Fronts], most: int | None = None
-) -> tuple[list[Outlines], list[Samples]]:
-    """Outlines of each view between what is seen at centres (K, H, W), of at most `most` breaks; samples of each part.
-
-    Samples of several views lie on triangles. They are one table for each part, view after view.
-    """
-    broken = each(lambda b: views[b].broken(layers[b], most), range(len(views)))
-    rows, samples = [np.full(one.parts.shape, -1, np.int32) for one in broken], []
-    while len(samples) < len(views[0].entries):
-        part = len(samples)
-        joint = views[0].joint(part)
-        stop = part + 1 if joint is None else joint.stop
-        inside = [(one.parts >= part) & (one.parts < stop) for one in broken]
-        points = [one.points[here] for one, here in zip(broken, inside, strict=True)]
-        known = [one.triangles[here] for one, here in zip(broken, inside, strict=True)]
-        fragments = [view.on_sheets(part, *one) for view, *one in zip(views, points, known, strict=True)]
-        together = None
-        if None not in fragments:
-            together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
-        if joint is not None:  # In a single view.
-            assert together is not None
-            lifted = joint.lifted(together)
-            firsts = np.cumsum([0, *(len(one.ids) for one in lifted.samples)], dtype=np.int32)
-            samples += lifted.samples
-            rows[0][inside[0]] = host_value(lifted.row)[0, 0] - firsts[broken[0].parts[inside[0]] - part]
-            continue
-        numbers = np.concatenate([one.numbers[here] for one, here in zip(broken, inside, strict=True)])
-        one, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
-        samples.append(one)
-        first = 0
-        for of_view, here, there in zip(rows, inside, points, strict=True):
-            of_view[here] = numbers[first : first + len(there)]
-            first += len(there)
-    return [view.found(one, at, samples) for view, one, at in zip(views, broken, rows, strict=True)], samples
 
 
 class _Broken(NamedTuple):
@@ -131,16 +92,28 @@ class Points:
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts, told)
 
-    @property
-    def entries(self) -> list[Any]:
-        """The prepared entry of each part."""
-        return [entry for _, _, entry, _ in self._parts]
+    def outlines(self, layers: Fronts, most: int | None = None) -> tuple[Outlines, list[Samples]]:
+        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; and their samples, by part."""
+        broken = self._broken(layers, most)
+        rows, samples = np.full(broken.parts.shape, -1, np.int32), []
+        joints = {joint.first: joint for joint in self._scene.joints}
+        while (part := len(samples)) < len(self._parts):
+            joint = joints.get(part)
+            inside = (broken.parts >= part) & (broken.parts < (part + 1 if joint is None else joint.stop))
+            points = broken.points[inside]
+            fragments = self._on_sheets(part, points, broken.triangles[inside])
+            if joint is not None:
+                assert fragments is not None
+                lifted = joint.lifted(fragments)
+                firsts = np.cumsum([0, *(len(one.ids) for one in lifted.samples)], dtype=np.int32)
+                samples += lifted.samples
+                rows[inside] = host_value(lifted.row)[0, 0] - firsts[broken.parts[inside] - part]
+                continue
+            one, rows[inside] = self._of_layers(part, points, broken.numbers[inside], fragments)
+            samples.append(one)
+        return self._found(broken, rows, samples), samples
 
-    def joint(self, part: int) -> Joint | None:
-        """The joint that begins with a part, if any."""
-        return next((joint for joint in self._scene.joints if joint.first == part), None)
-
-    def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Outlines:
+    def _found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Outlines:
         """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
         breaks, parts, _, _, _, sides, left = broken
         layered = sides.shape[-1] > 0
@@ -170,15 +143,15 @@ class Points:
             if not len(at):
                 continue
             ending, drawn = (at, breaks.near[at]), isinstance(known[0], TriangleSampler)
-            fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None
-            more = self.sample(index, points[ending], fragments, pairs=True)
+            fragments = self._on_sheets(index, points[ending], triangles[ending]) if drawn else None
+            more = self._sample(index, points[ending], fragments, pairs=True)
             if more.pair is not None:
                 found = host_value(more.pair).T[: len(at)]
                 rows[at] = np.where(found >= 0, found + samples[index].ids.shape[-2], -1)
             samples[index] = in_one_table([samples[index], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
 
-    def broken(self, layers: Fronts, most: int | None) -> _Broken:
+    def _broken(self, layers: Fronts, most: int | None) -> _Broken:
         """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
         breaks, *others = self._breaks(layers, self._told.colors)
         count, left = len(breaks.gap), 0
@@ -255,17 +228,17 @@ class Points:
         there = np.flatnonzero((names[:, 0] >= 0) & (high > low))
         return Hints(gaps.gap[names[there, 0]], (low[there] + high[there]) / 2)
 
-    def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
+    def _on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
         sheets = self._parts[part][-1]
         return sheets.at(triangles, points) if sheets is not None and (triangles >= 0).all() else None
 
-    def of_layers(
+    def _of_layers(
         self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None
     ) -> tuple[Samples, np.ndarray]:
         """Samples of one layer of a part at each point (M, 2), given their `numbers` (M,); and their rows (M,)."""
         most, count = numbers.max(initial=0), len(points)
-        samples = self.sample(part, points, fragments, layers=1 + most)
+        samples = self._sample(part, points, fragments, layers=1 + most)
         row = host_value(samples.row)[:, 0]
         if not most:
             return samples, row[0, :count]
@@ -275,7 +248,7 @@ class Points:
         used = used[none:].astype(np.int32) if len(used) > none else np.zeros(1, np.int32)
         return taken_rows(samples, engine_of(samples.row).constant(used, samples.row)), index_of.reshape(-1) - none
 
-    def sample(
+    def _sample(
         self,
         part: int,
         points: np.ndarray,
@@ -324,7 +297,7 @@ class Points:
         scene, none = self._scene, (count, len(points))
         part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
         for index, opaque in enumerate(scene.opaque):
-            samples = self.sample(index, points, layers=1 if opaque else count)
+            samples = self._sample(index, points, layers=1 if opaque else count)
             row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
             part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])

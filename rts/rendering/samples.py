@@ -71,13 +71,13 @@ def sampled_scene(
     size: tuple[int, int],
     settings: RenderSettings,
     one_shader: bool = True,
-    joins: bool = True,
+    stays: bool = False,
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window; see `sample`.
 
     With `one_shader` they serve the shaders of the scene and derivatives in its values alone, so that cells of one
-    colour may name one sample, and samples beside outlines need not tell motions of what is constant. With
-    `joins`, parts that are sampled at once have no cells of their own in `Samples`.
+    colour may name one sample, and samples beside outlines need not tell motions of what is constant. With `stays`,
+    samples that were found on the host are not moved into the scene's engine; see `in_engine`.
     """
     settings = settings.of(scene)
     factor, capacity = settings.supersample, settings.capacity
@@ -85,14 +85,14 @@ def sampled_scene(
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     given, (scene, grid) = scene, on_the_host(scene, grid)
-    if scene.cameras and joins and capacity is None and not settings.fronts:
+    if scene.cameras and capacity is None and not settings.fronts:
         scene = with_joints(scene, grid)
     told = settings.told([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.
     same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
     request = Request(capacity, triangles=outlines or settings.fronts, uniform=same)
     sampled = None
-    if outlines and joins and layers != "auto" and not settings.fronts:
+    if outlines and layers != "auto" and not settings.fronts:
         sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=settings.apron)
@@ -113,4 +113,4 @@ def sampled_scene(
             break
         least = 2 * sampled.row.shape[-3]
     sampled = replace(sampled, supersample=factor, apron=settings.apron)
-    return in_engine(sampled, given) if scene.cameras else sampled
+    return in_engine(sampled, given) if scene.cameras and not stays else sampled

@@ -22,7 +22,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 Find = Callable[..., tuple[Samples, Mapping[str, np.ndarray]]]
-"""(cameras, inputs of the proxy, further arrays), all on the host → samples, and further results by name."""
+"""(camera, inputs of the proxy, further arrays), all on the host → samples, and further results by name."""
 
 
 class SampleBounds(NamedTuple):
@@ -77,7 +77,7 @@ class HostCall:
     Args:
         part: the part.
         surface: its surface.
-        cameras: cameras in the part's local space, without derivatives.
+        camera: the camera in the part's local space, without derivatives.
         bounds: bounds on the number of samples.
         entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
         concurrent: True if several threads may sample the part at once, as they then do under `vmap`.
@@ -87,15 +87,15 @@ class HostCall:
         self,
         part: Part | CheckedPart,
         surface: TriangleSurface,
-        cameras: Sequence[Camera],
+        camera: Camera,
         bounds: SampleBounds,
         entry: Entry | None,
         concurrent: bool = False,
     ):
         self._concurrent = concurrent
-        self._surface, self._cameras, self._bounds, self._entry = surface, cameras, bounds, entry
+        self._surface, self._camera, self._bounds, self._entry = surface, camera, bounds, entry
         self._transform = [] if part.transform is None else [part.transform]
-        self._engine, like = context_of(part.theta, cameras)
+        self._engine, like = context_of(part.theta, camera)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
         self._theta = None
         if self._engine.differentiates:
@@ -133,29 +133,28 @@ class HostCall:
             tables[ON_RAYS] = self._bounds.row_spec(np.float32, 3)._replace(by_sample=True)
 
         # Programs keep the function, which must not keep what was traced.
-        views, moves, further_ones, entry = len(self._cameras), len(self._transform), len(arrays), self._entry
+        moves, further_ones, entry = len(self._transform), len(arrays), self._entry
         places, surface, theta = map_leaves(lambda _: 0.0, self._inputs), self._surface, self._theta
         attributes_of, view = self._attributes, self._bounds.view
 
-        def complete(seen: Sequence[Camera], moved: Sequence[np.ndarray], inputs: Tree, further: Sequence) -> tuple:
+        def complete(seen: Camera, moved: Sequence[np.ndarray], inputs: Tree, further: Sequence) -> tuple:
             """Samples with all their tables, and the further results."""
-            cameras = [check_camera(camera, *moved) for camera in seen]
-            found, more = find(cameras, inputs, *further)
+            camera = check_camera(seen, *moved)
+            found, more = find(camera, inputs, *further)
             if ON_RAYS in tables:
-                on_rays = _on_rays(found, cameras[0], view, *further)
+                on_rays = _on_rays(found, camera, view, *further)
                 found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
             return found, {name: _allotted(found.tables[name], spec) for name, spec in tables.items()}, more
 
         if not self._engine.differentiates:  # All is on the host already.
-            seen = [on_host(camera) for camera in self._cameras]
             inputs = self._inputs if entry is None else entry.inputs
-            found, filled, more = complete(seen, self._transform, inputs, arrays)
+            found, filled, more = complete(on_host(self._camera), self._transform, inputs, arrays)
             cells = Cells(found.row, found.depth)
             return self._packed(found.ids, found.params, cells, found.overflow, filled, tables), dict(more)
 
         def host(*operands: np.ndarray) -> tuple[Any, ...]:
             it = iter(operands)
-            seen = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in range(views)]
+            seen = Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64))
             moved = [next(it) for _ in range(moves)]
             further = [next(it) for _ in range(further_ones)]
             inputs = map_leaves(lambda _: next(it), places) if entry is None else entry.inputs
@@ -170,8 +169,7 @@ class HostCall:
 
         sample_specs = self._bounds.specs(self._surface.sample_widths)
         specs = *sample_specs, *beside.values(), *tables.values(), *self._attributes.values()
-        matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
-        operands = *matrices, *self._transform, *arrays, *leaves(self._inputs)
+        operands = self._camera.view, self._camera.projection, *self._transform, *arrays, *leaves(self._inputs)
         results = iter(self._engine.call_host(OnAllCores(host) if self._concurrent else host, specs, *operands))
         ids, params, row, depth, overflow = islice(results, len(sample_specs))
         more, filled, attributes = (dict(zip(x, results, strict=False)) for x in (beside, tables, self._attributes))

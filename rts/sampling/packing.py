@@ -28,7 +28,6 @@ def pack_fragments(
     proxy: Proxy,
     capacity: int | None = None,
     kept: np.ndarray | None = None,
-    views: tuple[int, int] = (1, 1),
 ) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
@@ -40,7 +39,6 @@ def pack_fragments(
         proxy: the triangles.
         capacity: rows to allot; samples beyond are dropped, and counted in `overflow`. None for as many as are taken.
         kept: (K, H, W) bool, the `covered_cells` to take; None for all.
-        views: number of views in the grid, down and across; each is numbered by itself, one after the other.
     """
     from rts.sampling import packing_loops
 
@@ -48,7 +46,7 @@ def pack_fragments(
         kept, _ = covered_cells(fragments.triangle_ids)
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
-    packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0, views)
+    packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0)
     ids, params, row, depth, total = packed
     return Samples(ids, params, Cells(row, depth), np.asarray(max(0, total - len(ids)), np.int32))
 

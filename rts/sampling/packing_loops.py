@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ def pack(
     table: np.ndarray,
     corner_params: np.ndarray | None,
     capacity: int,
-    views: tuple[int, int] = (1, 1),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of these cells.
 
@@ -29,77 +28,33 @@ def pack(
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are taken; for none, one in the middle of the first triangle.
-        views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
-    lines = _Lines.of(fragments, kept, views)
-    total = int(lines.counts.sum())
+    (layers, height, width), lines = kept.shape, kept.shape[0] * kept.shape[1]
+    taken, counts = np.ascontiguousarray(kept).reshape(lines, width), np.zeros(lines, np.int64)
+    parallel(_count, lines, taken, counts, work=kept.size // 8)
+    total = int(counts.sum())
     rows = capacity or max(1, total)
-    found = min(rows, total)
-    make = np.zeros if rows > found else np.empty
+    make = np.zeros if rows > total else np.empty
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
     # Without corner parameters, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
-    row, depth = np.empty(lines.kept.shape, np.int32), np.empty(lines.kept.shape, np.float32)
-    arrays = lines.kept, lines.triangle_ids, lines.barycentrics, lines.depths, table, corners, lines.offsets()
-    parallel(_pack, len(row), *arrays, ids, params, row, depth, work=2 * row.size)
+    row, depth = np.empty((lines, width), np.int32), np.empty((lines, width), np.float32)
+    dtypes = np.int32, np.float32, np.float32
+    of_lines = [
+        np.ascontiguousarray(x, dtype).reshape(lines, width, *x.shape[3:])
+        for x, dtype in zip(fragments, dtypes, strict=True)
+    ]
+    arrays = taken, *of_lines, table, corners, np.cumsum(counts) - counts, ids, params, row, depth
+    parallel(_pack, lines, *arrays, work=2 * row.size)
     if not total and not capacity and len(table):
         ids[0], params[0] = middle_of(table, corner_params, 0)
-    return ids, params, row.reshape(lines.shape), depth.reshape(lines.shape), total
+    return ids, params, row.reshape(layers, height, width), depth.reshape(layers, height, width), total
 
 
 def middle_of(table: np.ndarray, corner_params: np.ndarray | None, triangle: int) -> tuple[np.ndarray, Any]:
     """Ids (I,) and params (P,) of the middle of a triangle, for a row that no cell names, but shaders see."""
     return table[triangle], 1 / 3 if corner_params is None else corner_params[triangle].mean(axis=0)
-
-
-class _Lines(NamedTuple):
-    """Fragments as lines of cells of a view, with the fragments to take and their number in each line.
-
-    Attributes:
-        kept: (L, W) bool, the fragments to take. L counts lines layer by layer, each line of the grid cut into views.
-        triangle_ids: (L, W) int32.
-        barycentrics: (L, W, 2) float32.
-        depths: (L, W) float32.
-        counts: (L,) int64, the number of fragments to take.
-        shape: (K, height, width) of the whole grid.
-        views: the number of views in the grid, down and across.
-    """
-
-    kept: np.ndarray
-    triangle_ids: np.ndarray
-    barycentrics: np.ndarray
-    depths: np.ndarray
-    counts: np.ndarray
-    shape: tuple[int, int, int]
-    views: tuple[int, int]
-
-    @classmethod
-    def of(cls, fragments: Fragments, kept: np.ndarray, views: tuple[int, int] = (1, 1)) -> _Lines:
-        """The lines of fragments (K, H, W), of which `kept` (K, H, W) bool are to be taken."""
-        shape, across = kept.shape, views[1]
-        lines, width = shape[0] * shape[1] * across, shape[2] // across
-        triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
-        barycentrics = np.ascontiguousarray(fragments.barycentrics, np.float32).reshape(lines, width, 2)
-        depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
-        taken, counts = np.ascontiguousarray(kept).reshape(lines, width), np.zeros(lines, np.int64)
-        parallel(_count, lines, taken, counts, work=kept.size // 8)
-        return cls(taken, triangle_ids, barycentrics, depths, counts, shape, views)
-
-    def offsets(self) -> np.ndarray:
-        """The number of cells taken before each line: view after view, each layer by layer."""
-        (layers, height, _), (down, across) = self.shape, self.views
-        counts = self.counts.reshape(layers, down, height // down, across).transpose(1, 3, 0, 2)
-        before = (np.cumsum(counts) - counts.reshape(-1)).reshape(counts.shape)
-        return np.ascontiguousarray(before.transpose(2, 0, 3, 1)).reshape(-1)
-
-
-def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
-    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across): (B,), by rows."""
-    layers, height, width = kept.shape
-    lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
-    parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)
-    return counts.reshape(layers, views[0], -1, views[1]).sum(axis=(0, 2)).reshape(-1)
 
 
 @loop
@@ -121,7 +76,7 @@ def param_at(corners, t, i, a, b):
 
 @loop
 def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
-    """Pack the kept fragments of lines [start, stop); see `_Lines` for the first four arrays.
+    """Pack the kept fragments of lines [start, stop), of L lines of cells, layer by layer.
 
     Args:
         start: first line.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -190,13 +190,13 @@ class TriangleSampler(Sampler):
             **({"triangle": ArraySpec((layers, *cells), np.int32)} if request.triangles and not moves else {}),
         }
 
-        def find(cameras: Sequence[Camera], inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
+        def find(camera: Camera, inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             host_points = np.asarray(further[0], np.float64) if further else None
-            search = TriangleSearch(self, surface, part.cull, inputs, cameras[0], bounds, tables, entry, host_points)
+            search = TriangleSearch(self, surface, part.cull, inputs, camera, bounds, tables, entry, host_points)
             samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
-        call = HostCall(part, surface, [camera], bounds, entry, self.draws_at_once)
+        call = HostCall(part, surface, camera, bounds, entry, self.draws_at_once)
         samples, more = call.samples(find, beside, tables, [] if points is None else [points[None, ...]])
         return samples.replace(**more, at_points=points is not None)
 

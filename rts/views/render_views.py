@@ -22,14 +22,14 @@ from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
+from rts.sampling.host_scenes import in_engine
 from rts.sampling.picture import Picture, at_once
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import DrawnView
 from rts.scene.camera import Camera
 from rts.splatting.channels import cropped_image
 from rts.views.joint_views import sampled_at_once
-from rts.views.outlines import with_outlines_of_views
-from rts.views.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
+from rts.views.sampled_views import Views, laid_side_by_side
 from rts.views.scenes import SceneParts, check_scene_channels, distinct, scenes_of_views
 from rts.views.splats import views_to_splats
 
@@ -182,26 +182,18 @@ def _images_of_scene(
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
     if settings.layers != "auto" and len(settings.bands(size)) == 1:
-        height, width = (settings.supersample * n + 2 * settings.apron for n in size)
+        height, width = (n + 2 * settings.apron for n in _cells(size, settings))
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
-        samplings = [Sampling(chunk, place._replace(views=len(chunk)), size, settings) for chunk in chunks]
         # Which rows are in use is unknown if they are padded, so that one call must serve all views.
-        padded = engine.padded(like)
-        one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
-        if place.views > 1 and all(sampling.possible for sampling in samplings):
-            countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            # Outlines of padded samples are found view by view.
-            if (one_call and not settings.finds_outlines) if padded else countable:
-                pictures = [_sampled_as_one(sampling) for sampling in samplings]
-                return _as_pictures(pictures, scenes, context, settings)
-        outlined = settings.finds_outlines and place.views > 1 and (one_call or not padded)
+        one_call = len(chunks) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
+        outlined = settings.finds_outlines and place.views > 1 and (one_call or not engine.padded(like))
         if (several and differentiates) or outlined:
-            views = _sampled_at_once(scenes, size, settings)
+            views = _sampled(scenes, size, settings)
             pictures = [
                 laid_side_by_side(chunk, place._replace(views=len(chunk))) for chunk in _chunks(views, place.views)
             ]
-            complete = [picture for picture in pictures if picture is not None]
+            complete = [_in_engine(picture, scenes[0]) for picture in pictures if picture is not None]
             if len(complete) == len(pictures):
                 return _as_pictures(complete, scenes, context, settings)
             return _one_by_one(scenes, views, context, settings)
@@ -213,19 +205,19 @@ def _images_of_scene(
     return namespace(*images).stack(images)
 
 
-def _sampled_as_one(sampling: Sampling) -> Views:
-    """The views of a picture, with their outlines if the splatter reads these."""
-    views = sampled_as_one(sampling)
-    return with_outlines_of_views(views, sampling) if sampling.settings.finds_outlines else views
-
-
-def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
-    """The samples of each view; every core samples one view at a time, if threads may."""
+def _sampled(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
+    """The samples of each view, on the host if they are found there; each core samples one at a time, if it may."""
 
     def sample_view(view_scene: Scene) -> Sampled:
-        return sampled_scene(view_scene, view_scene.camera, size, settings, joins=False)
+        return sampled_scene(view_scene, view_scene.camera, size, settings, stays=True)
 
     return each(sample_view, scenes) if _concurrent(scenes[0]) else list(map(sample_view, scenes))
+
+
+def _in_engine(views: Views, scene: Scene) -> Views:
+    """Views of a scene with samples in arrays of its engine, wherever they were found."""
+    on_host = type(views.sampled.row) is np.ndarray
+    return views._replace(sampled=in_engine(views.sampled, scene)) if on_host else views
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:

@@ -167,6 +167,7 @@ def test_compiled_silhouettes_are_those_of_a_loop(capacity):
     np.testing.assert_allclose(found[1], expected[1], atol=1e-4 * float(np.abs(expected[1]).max()))
 
 
+@pytest.mark.filterwarnings("ignore:.* samples find no room:rts.errors.InputWarning")
 def test_what_does_not_fit_is_left_out_of_its_own_view():
     jax = pytest.importorskip("jax")
     part = mesh_part(icosphere(1), shader="normals")
