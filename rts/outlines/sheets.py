@@ -56,7 +56,7 @@ class Sheets(NamedTuple):
         size: tuple[int, int],
         cull: str,
         first: int = 0,
-        proxies: Sequence[Proxy] | None = None,
+        proxies: Sequence[Proxy] = (),
         seams: bool = False,
     ) -> Sheets:
         """The sheets of a proxy.
@@ -67,7 +67,7 @@ class Sheets(NamedTuple):
             size: (height, width) of the grid of cells.
             cull: as in `TriangleSampler.rasterize`.
             first: the index of the first part.
-            proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; None for one.
+            proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; none for one.
             seams: whether sheets end at seams (`Proxy.corners`), too.
         """
         from rts.outlines import sheets_loops, silhouettes_loops
@@ -87,7 +87,7 @@ class Sheets(NamedTuple):
                 faces = read_only(tables[0] if len(moved) == 1 else np.concatenate(moved), np.int32)
         starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
         beyond = [_beyond(table) for table in tables]
-        if proxies is not None:
+        if len(beyond) > 1:
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
         beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))

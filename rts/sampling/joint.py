@@ -1,7 +1,7 @@
-"""Neighbouring parts of few triangles as one table, in the camera's space, so that a sampler draws all at once.
+"""Parts of triangles as one table, so that a sampler draws all at once: a single part, or neighbours of few triangles.
 
-Each part still has samples of its own, behind one another: the table says which part a triangle belongs to. A part
-costs a transform of its vertices and a call of its shader, but no pass over the image.
+Each part has samples of its own, behind one another: the table says which part a triangle belongs to. A neighbour costs
+a transform of its vertices, into the camera's space, and a call of its shader, but no pass over the image.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +17,14 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 MOST = 2**15
-"""Triangles of a part that is joined: to move the vertices of a larger one costs more than a pass over the image."""
+"""Triangles of a part that is joined to others: moving the vertices of a larger one costs more than a pass over the
+image."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Joint:
         camera: float64 matrices on the host.
         cull: of all parts.
         sampler: of all parts.
+        prepared: the result of its `prepare` for all triangles.
     """
 
     scene: Scene
@@ -49,6 +51,7 @@ class Joint:
     camera: Camera
     cull: str
     sampler: TriangleSampler
+    prepared: Any
 
     @property
     def parts(self) -> Sequence[CheckedPart]:
@@ -76,14 +79,19 @@ class Joint:
     ) -> Joint:
         """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
         starts = np.cumsum([0, *(len(proxy.faces) for proxy in proxies)], dtype=np.int32)
-        shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
-        faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
-        ids = np.concatenate([proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies])
-        params = [proxy.corner_params for proxy in proxies if proxy.corner_params is not None]
-        proxy = Proxy(np.concatenate(vertices), faces, ids, np.concatenate(params) if params else None)
-        sampler = scene.samplers[first]
+        sampler, proxy = scene.samplers[first], proxies[0]
         assert isinstance(sampler, TriangleSampler)
-        return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler)
+        ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
+        if len(proxies) == 1:  # Nothing is copied.
+            proxy, prepared = proxy._replace(ids=ids[0]), scene.entries[first].prepared
+        else:
+            shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
+            faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
+            params = [proxy.corner_params for proxy in proxies if proxy.corner_params is not None]
+            tables = np.concatenate(vertices), faces, np.concatenate(ids), np.concatenate(params) if params else None
+            proxy = Proxy(*tables)
+            prepared = sampler.prepare(proxy)
+        return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler, prepared)
 
     def sampled(self, size: tuple[int, int], layers: int, triangles: bool, uniform: bool = False) -> Sampled:
         """The samples at the centres of all cells; with `uniform` one sample stands for all cells of a part.
@@ -91,7 +99,7 @@ class Joint:
         With `triangles` there are `Cells.triangle`, which count triangles over the parts.
         """
         grid = layers, *size
-        fragments = self.sampler.rasterize(self.sampler.prepare(self.proxy), self.camera, size, layers, self.cull)
+        fragments = self.sampler.rasterize(self.prepared, self.camera, size, layers, self.cull)
         covered = check_fragments(fragments, grid, len(self.proxy.faces), self.sampler)
         sampled = self._of_one_row_each(fragments, covered) if uniform else self.lifted(fragments, covered)
         return sampled if triangles else replace(sampled, cells=replace(sampled.cells, triangle=None))
@@ -103,64 +111,61 @@ class Joint:
             fragments: on the host.
             covered: (K, H, W) bool, the cells in which there is one; None for all.
         """
-        from rts.sampling import joint_loops
+        from rts.sampling import packing_loops
 
         ids, proxy = fragments.triangle_ids, self.proxy
         covered = ids >= 0 if covered is None else covered
         assert proxy.ids is not None
-        counts, ids_of_parts, params, row, depth = joint_loops.packed_by_part(
-            fragments, covered, self.starts, proxy.ids, proxy.corner_params
+        counts, ids_of_parts, params, row, depth = packing_loops.pack(
+            fragments, covered, proxy.ids, proxy.corner_params, starts=self.starts
         )
         return self._of_parts(counts, ids_of_parts, params, Cells(row, depth, ids))
 
     def _of_one_row_each(self, fragments: Fragments, covered: np.ndarray) -> Sampled:
         """Samples of fragments (K, H, W) of which one, at the first of its cells, stands for all cells of a part."""
-        from rts.sampling import joint_loops
+        from rts.sampling import packing_loops
 
-        row, first = joint_loops.parts_of(fragments.triangle_ids, covered, self.starts)
-        seen, depth = first >= 0, np.where(covered, fragments.depth, np.float32(0))
-        one = Fragments(*(x.reshape(1, 1, row.size, *x.shape[3:])[:, :, first[seen]] for x in fragments))
-        packed = pack_fragments(one, self.proxy)
-        ids, params = (np.empty((len(seen), x.shape[1]), x.dtype) for x in (packed.ids, packed.params))
-        ids[seen], params[seen] = packed.ids[: seen.sum()], packed.params[: seen.sum()]
-        for part in np.flatnonzero(~seen):
-            table, start = self.proxy, self.starts[part]
-            assert table.ids is not None
-            ids[part], params[part] = joint_loops.middle_of(table.ids, table.corner_params, start)
-        return self._of_parts(seen, ids, params, Cells(row, depth, fragments.triangle_ids))
+        row, first = packing_loops.parts_of(fragments.triangle_ids, covered, self.starts)
+        table, seen = self.proxy, first[first >= 0]
+        assert table.ids is not None
+        one = Fragments(*(x.reshape(1, 1, row.size, *x.shape[3:])[:, :, seen] for x in fragments))
+        known = np.ones((1, 1, len(seen)), np.bool_), table.ids, table.corner_params
+        counts, ids, params, *_ = packing_loops.pack(one, *known, starts=self.starts)
+        depth = np.where(covered, fragments.depth, np.float32(0))
+        return self._of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
 
     def _of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
         """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row."""
-        ends = np.cumsum(np.maximum(counts, 1))[:-1]
-        tables = zip(np.split(ids, ends), np.split(params, ends), counts > 0, strict=True)
-        samples, none = [], np.asarray(0, np.int32)
-        for part, (ids_of_part, params_of_part, seen) in zip(self.parts, tables, strict=True):
-            used = np.arange(len(ids_of_part), dtype=np.int32)[None, None] - np.int32(not seen)
-            samples.append(Samples(ids_of_part, params_of_part, Cells(used), none, gbuffer_names=part.reads))
+        samples, none, stop = [], np.asarray(0, np.int32), 0
+        for part, count in zip(self.parts, counts.tolist(), strict=True):
+            start, stop = stop, stop + max(count, 1)
+            used = np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count)
+            rows = ids[start:stop], params[start:stop]
+            samples.append(Samples(*rows, Cells(used), none, gbuffer_names=part.reads))
         return Sampled(tuple(samples), cells, none)
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:
-    """A scene on the host with its `joints`, where neighbouring parts can be sampled at once.
+    """A scene on the host with its `joints`: single parts, and neighbours that can be sampled at once.
 
     These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
     """
-    if len(scene.parts) < 2:
-        return scene
     suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
-    if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)):
+    if not any(suited) or not all(map(has_sheets, scene.parts, scene.samplers)):
         return scene
     joints = []
     runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))
     for (suits, *_), run in runs:
-        indices = list(run)
-        if suits and len(indices) > 1:
-            joints += _joined(scene, grid, indices)
+        if suits:
+            joints += _joined(scene, grid, list(run))
     return scene._replace(joints=tuple(joints))
 
 
 def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
-    """Joints of some neighbouring parts: of few triangles, alike in their tables, and not both culled and mirrored."""
+    """Joints of some neighbouring parts: of few triangles, alike in their tables, and not both culled and mirrored.
+
+    Others, but for those without triangles, are joints of their own.
+    """
     proxies, cameras = {}, {}
     for index in indices:
         proxies[index] = scene.entries[index].proxy
@@ -172,10 +177,11 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
         tables = (None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params))
         return 0 < len(proxy.faces) <= MOST and not mirrored, *tables
 
-    for (joins, *_), run in itertools.groupby(indices, kind):
+    groups = [((False,), indices)] if len(indices) == 1 else itertools.groupby(indices, kind)
+    for (joins, *_), run in groups:
         numbers = list(run)
-        if joins and len(numbers) > 1:
-            yield Joint.of(scene, numbers[0], [proxies[i] for i in numbers], [cameras[i] for i in numbers])
+        for several in [numbers] if joins else [[number] for number in numbers if len(proxies[number].faces)]:
+            yield Joint.of(scene, several[0], [proxies[i] for i in several], [cameras[i] for i in several])
 
 
 def is_suited(part: CheckedPart, sampler: object) -> bool:
