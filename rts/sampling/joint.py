@@ -82,7 +82,7 @@ class Joint:
         sampler, proxy = scene.samplers[first], proxies[0]
         assert isinstance(sampler, TriangleSampler)
         ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
-        if len(proxies) == 1:  # Nothing is copied.
+        if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
             proxy, prepared = proxy._replace(ids=ids[0]), scene.entries[first].prepared
         else:
             shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)

@@ -200,7 +200,8 @@ def test_rows_that_a_sampler_has_not_packed_are_refused(count, splatter):
 
 
 def test_rows_of_another_part_are_refused_when_parts_are_merged():
-    samples = [sample(card(z), CAMERA, SIZE, splatter=None, layers=2).samples[0] for z in (0.0, -0.5)]
+    sampler = rts.plugin("samplers", "raster")()
+    samples = [sampler.sample(card(z), CAMERA, SIZE, layers=2) for z in (0.0, -0.5)]
     last = len(samples[0].ids) - 1
     merge(samples, 2)
     with refused(f"row of part 0 refers to sample {last + 1} of {last + 1}"):

@@ -1,5 +1,7 @@
 """Many parts: those that are drawn at once give the image and the gradient of one part at a time."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from helpers import CAMERA, TORCH, arrays, box, gradient, icosphere, relative_error, rigid, soup, to_numpy
@@ -64,9 +66,17 @@ def image_of(parts, **options):
 
 
 def kinds_of(parts, **options):
-    """How many parts each pass of the sampler draws, as rows of samples with cells of their own say."""
-    sampled = rts.sample(parts, CAMERA, SIZE, engine="torch", **options)
-    return [own.row.shape[:2] == (1, 1) for own in sampled.samples]
+    """For each part, whether a pass of the sampler draws it along with others."""
+    together, of = set(), joint.Joint.of
+
+    def noted(scene, first, proxies, cameras):
+        if len(proxies) > 1:
+            together.update(range(first, first + len(proxies)))
+        return of(scene, first, proxies, cameras)
+
+    with mock.patch.object(joint.Joint, "of", noted):
+        rts.sample(parts, CAMERA, SIZE, engine="torch", **options)
+    return [index in together for index in range(len(parts))]
 
 
 def test_parts_without_transforms_are_bit_for_bit_as_one_at_a_time(singly):
