@@ -57,8 +57,9 @@ def vertex_normals(vertices: Array, faces: Array) -> tuple[Array, Array]:
 
 def face_normals(vertices: Array, ids: Array) -> Array:
     """Normals (N, 3) of the triangles whose vertices are the first three `ids` (N, I), twice their areas long."""
-    origin = take(vertices, ids[:, 0])
-    return namespace(vertices, ids).linalg.cross(take(vertices, ids[:, 1]) - origin, take(vertices, ids[:, 2]) - origin)
+    xp = namespace(vertices, ids)
+    corners = xp.reshape(take(vertices, xp.reshape(ids[:, :3], (-1,))), (-1, 3, 3))
+    return xp.linalg.cross(corners[:, 1, :] - corners[:, 0, :], corners[:, 2, :] - corners[:, 0, :])
 
 
 def with_own_normals(normals: Array, cancelled: Array, vertices: Array, params: Array, ids: Array) -> Array:

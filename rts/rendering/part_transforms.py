@@ -29,13 +29,12 @@ class OneTransform(NamedTuple):
 
     def normals(self, normals: Array) -> Array:
         """Normals (N, 3), of any length, moved: times the cofactor matrix; a mirror keeps them outward."""
-        return affine_map(_linear(_cofactors(*_columns(self.matrix))[0]), normals)
+        return affine_map(_linear(_cofactors(self.matrix)[0]), normals)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), of any length, moved; a mirror changes the signs."""
-        columns = _columns(self.matrix)
-        moved = affine_map(_linear(columns), tangents[:, :3])
-        return namespace(moved).concat([moved, tangents[:, 3:] * _cofactors(*columns)[1]], axis=1)
+        moved = affine_map(_linear(self.matrix[:3, :3]), tangents[:, :3])
+        return namespace(moved).concat([moved, tangents[:, 3:] * _cofactors(self.matrix)[1][:, 0]], axis=1)
 
 
 class ViewTransforms(NamedTuple):
@@ -63,37 +62,33 @@ class ViewTransforms(NamedTuple):
 
     def normals(self, normals: Array) -> Array:
         """Normals (N, 3), moved."""
-        return self._turned(_cofactors(*_columns(self.matrices))[0], normals)
+        return self._turned(_cofactors(self.matrices)[0], normals)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), moved."""
-        columns = _columns(self.matrices)
-        moved, sign = self._turned(columns, tangents[:, :3]), _cofactors(*columns)[1]
+        moved, sign = self._turned(self.matrices[:, :3, :3], tangents[:, :3]), _cofactors(self.matrices)[1][..., 0]
         return namespace(moved).concat([moved, tangents[:, 3:] * take(sign, index_of_views(self.view))], axis=1)
 
-    def _turned(self, columns: Sequence[Array], vectors: Array) -> Array:
-        """Vectors (N, 3) times the matrices with three columns (B, 3)."""
-        return affine_map_of_views(_linear(columns), vectors, self.view)
+    def _turned(self, matrices: Array, vectors: Array) -> Array:
+        """Vectors (N, 3) times the matrices (B, 3, 3)."""
+        return affine_map_of_views(_linear(matrices), vectors, self.view)
 
 
-def _linear(columns: Sequence[Array]) -> Array:
-    """Linear maps as affine ones (..., 3, 4), from three columns (..., 3)."""
-    xp = namespace(columns[0])
-    return xp.stack([*columns, xp.zeros_like(columns[0])], axis=-1)
+def _linear(matrix: Array) -> Array:
+    """Linear maps (..., 3, 3) as affine ones (..., 3, 4)."""
+    xp = namespace(matrix)
+    return xp.concat([matrix, xp.zeros_like(matrix[..., :1])], axis=-1)
 
 
-def _columns(matrix: Array) -> list[Array]:
-    """The columns (..., 3) of the linear part of affine maps (..., 4, 4)."""
-    return [matrix[..., :3, i] for i in range(3)]
+def _cofactors(matrix: Array) -> tuple[Array, Array]:
+    """The cofactor matrix (..., 3, 3) of the linear part of affine maps (..., 4, 4), times the sign of its determinant.
 
-
-def _cofactors(a: Array, b: Array, c: Array) -> tuple[list[Array], Array]:
-    """The columns (..., 3) of the cofactor matrix of one with columns (..., 3), times the sign of its determinant.
-
-    Also this sign (..., 1): 1, or −1 for a mirror.
+    Also this sign (..., 1, 1): 1, or −1 for a mirror.
     """
-    xp = namespace(a)
-    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    volume = xp.sum(a * cofactors[0], axis=-1, keepdims=True)
+    xp, rows = namespace(matrix), matrix[..., :3, :3]
+    # Each row is the cross product of the next two.
+    following = [xp.concat([rows[..., n:, :], rows[..., :n, :]], axis=-2) for n in (1, 2)]
+    cofactors = xp.linalg.cross(*following)
+    volume = xp.sum(rows[..., :1, :] * cofactors[..., :1, :], axis=-1, keepdims=True)
     sign = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
-    return [column * sign for column in cofactors], sign
+    return cofactors * sign, sign
