@@ -330,7 +330,7 @@ def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle
     # The mean of one or both sides; 0 where neither shows the outline.
     known, change = known.reshape(2, -1), np.where(known, low / shift, 0.0).reshape(2, -1)
     way = step[: len(at), ::-1] + (change.sum(0) / np.maximum(known.sum(0), 1))[:, None] * step[: len(at)]
-    direction[at] = known.any(0)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction[at] = (known.sum(0) > 0)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
     return direction
 
 
