@@ -16,8 +16,8 @@ from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
+from rts_surfaces import smooth_normals as smooth
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
-from rts_surfaces.smooth_normals import face_normals, smooth_normals, table_of, vertex_normals, with_own_normals
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangents")
 
@@ -67,6 +67,7 @@ class Mesh(TriangleSurface):
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray, np.ndarray] | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
+        self._looked_at = False
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make a copy's tables read-only, too."""
@@ -162,7 +163,7 @@ class Mesh(TriangleSurface):
         """Interpolated positions and attributes; see the class for their names."""
         vertices = with_room(theta["vertices"])
         gbuffer = GBuffer(position=self._interpolate(vertices, samples, 0))
-        gbuffer.defer("face_normal", partial(face_normals, vertices, samples.ids))
+        gbuffer.defer("face_normal", partial(smooth.face_normals, vertices, samples.ids))
         for name in self._attributes(theta):
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
@@ -177,14 +178,17 @@ class Mesh(TriangleSurface):
         return interpolate(rows, samples.ids, column, samples.params)
 
     def _smooth_normals(self, vertices: Array, samples: Samples) -> Array:
-        """Normals (N, 3) at samples where θ has none."""
+        """Normals (N, 3) at samples where θ has none; the first time, a warning if they are of no use."""
+        if not self._looked_at:
+            self._looked_at = True
+            smooth.warn_of_windings(self.faces)
         if exemplar(vertices) is None:
             normals, cancelled = self._vertex_normals(vertices)
             found = self._interpolate(normals, samples, 0)
             if not cancelled.any():
                 return found
-            return with_own_normals(found, cancelled, vertices, samples.params, samples.ids)
-        return smooth_normals(vertices, samples.params, samples.ids, self.faces)
+            return smooth.with_own_normals(found, cancelled, vertices, samples.params, samples.ids)
+        return smooth.smooth_normals(vertices, samples.params, samples.ids, self.faces)
 
     def vertex_normals(self, vertices: Array) -> Array:
         """Unit normals (V, 3): directions of the area-weighted sums over the faces around each vertex, or zero.
@@ -197,10 +201,10 @@ class Mesh(TriangleSurface):
 
     def _vertex_normals(self, vertices: Array) -> tuple[Array, Array]:
         if exemplar(vertices) is not None:
-            return vertex_normals(vertices, table_of(self.faces, vertices))
+            return smooth.vertex_normals(vertices, smooth.table_of(self.faces, vertices))
         key, kept = fingerprint(vertices), self._normals
         if kept is None or kept[0] != key:
-            kept = self._normals = (key, *vertex_normals(vertices, self.faces))
+            kept = self._normals = (key, *smooth.vertex_normals(vertices, self.faces))
         return kept[1:]
 
 

@@ -7,12 +7,31 @@ from functools import partial
 
 import numpy as np
 
-from rts import InputError, engine_of, namespace
+from rts import InputError, engine_of, errors, namespace
 from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, filled_up, interpolate, take
 
 CANCELLED = 1e-3
 """Sums over faces that are shorter than this share of what they add up are no directions; see `smooth_normals`."""
+
+LOOKED_AT, MIXED = 1 << 16, 0.05
+"""Faces of a mesh whose edges are looked at, and the share of these, of those that two faces share, from which the
+faces count as wound in different ways: a strip with one side only has a few such edges."""
+
+
+def warn_of_windings(faces: np.ndarray) -> None:
+    """Warn of faces (T, 3) many of which are wound against their neighbours, so that sums of normals are no normals."""
+    start, end = faces[:LOOKED_AT].astype(np.int64), np.roll(faces[:LOOKED_AT], -1, axis=1)
+    keys = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
+    _, edge, count = np.unique(keys.reshape(-1), return_inverse=True, return_counts=True)
+    same_way = np.abs(np.bincount(edge.reshape(-1), np.where(start < end, 1, -1).reshape(-1)))[count == 2] == 2
+    if same_way.any() and same_way.mean() > MIXED:
+        errors.warn(
+            f"across {same_way.mean():.0%} of the edges of a mesh its triangles are wound against one another, where "
+            "normals cancel, and shading is wrong; turn some of the triangles over, as rts.load does with those of "
+            "files, or give theta['normals']",
+            errors.InputWarning,
+        )
 
 
 def smooth_normals(vertices: Array, params: Array, ids: Array, faces: np.ndarray) -> Array:

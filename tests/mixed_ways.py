@@ -18,6 +18,7 @@ from helpers import arrays, derivative, gradient, to_numpy
 from mixed_scenes import mixed_of
 
 import rts
+from rts.arrays.engines import context_of
 from rts.arrays.trees import leaves, map_leaves
 from rts.compiling import threads
 from rts.rendering.settings import RenderSettings
@@ -210,9 +211,14 @@ def _patched(way):
         if "bands" in way:
             patch.setattr(RenderSettings, "bands", _thin_bands)
         if "specified" in way:
-            patch.setattr(stencil, "SPLAT", stencil._specification)
+            patch.setattr(stencil, "SPLAT", _specified_splat)
             patch.setattr(layers, "LAYERS", layers._specification)
         yield
+
+
+def _specified_splat(*arrays, **options):
+    """The specification of `stencil.SPLAT`, which takes what is NumPy beside arrays of an engine, as that does."""
+    return stencil._specification(*context_of(list(arrays)).constants(list(arrays)), **options)
 
 
 def _thin_bands(_, size):

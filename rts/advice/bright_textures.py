@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Sequence
 from typing import Any
 
+from rts.advice.empty_images import is_new
 from rts.arrays.engines import namespace, value_of
 from rts.contracts.checked_parts import CheckedPart
 from rts.errors import InputWarning, warn
@@ -13,7 +14,7 @@ from rts.errors import InputWarning, warn
 BYTES = 64.0
 """Colours beyond this are taken for bytes. A texture is a share of light, which is at most 1, or somewhat brighter."""
 
-_looked_at: weakref.WeakKeyDictionary[Any, None] = weakref.WeakKeyDictionary()
+_looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def warn_of_bright_textures(parts: Sequence[CheckedPart]) -> None:
@@ -26,15 +27,12 @@ def warn_of_bright_textures(parts: Sequence[CheckedPart]) -> None:
         texture = part.theta.get("texture")
         if texture is None or (part.reads is not None and "texture" not in part.reads):
             continue
-        try:
-            if part.surface in _looked_at:
-                continue
-            most = _largest(texture)
-            if most is not None:
-                _looked_at[part.surface] = None
-        except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
+        if not is_new(part.surface, _looked_at):
             continue
-        if most is not None and most > BYTES:
+        most = _largest(texture)
+        if most is None:
+            _looked_at.discard(part.surface)
+        elif most > BYTES:
             warn(
                 f"theta['texture'] of part {index} goes up to {most:g}; expected linear colours from 0 to 1, where "
                 "white is 1: divide a picture from 0 to 255 by 255 and decode its sRGB, as rts.load_image does",

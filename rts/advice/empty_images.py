@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -91,3 +93,13 @@ def known_tree(tree: Tree) -> Tree | None:
 
     host = map_leaves(value, tree)
     return host if all(is_known) else None
+
+
+def is_new(surface: Any, seen: weakref.WeakSet[Any]) -> bool:
+    """True for a surface that is not among those `seen`, where it is from now on."""
+    try:
+        new = surface not in seen
+        seen.add(surface)
+    except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
+        return False
+    return new

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.advice.empty_images import known_tree
+from rts.advice.empty_images import is_new, known_tree
 from rts.arrays.engines import stopped
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
@@ -27,23 +27,13 @@ def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
     Surfaces whose triangles are costly or depend on the view are left out.
     """
     for index, part in enumerate(parts):
-        if part.cull != "back" or _triangles_of(part) is None or not _is_new(part.surface):
+        if part.cull != "back" or not is_new(part.surface, _looked_at):
             continue
         inside_out = is_inside_out(part, camera)
         if inside_out is None:
             _looked_at.discard(part.surface)
         if inside_out:
             warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
-
-
-def _is_new(surface: Any) -> bool:
-    """True for a surface that was not checked before; it counts as checked from now on."""
-    try:
-        new = surface not in _looked_at
-        _looked_at.add(surface)
-    except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
-        return False
-    return new
 
 
 INSIDE_OUT = "is closed and wound inside out: cull='back' leaves out the side that faces the viewer"
@@ -55,8 +45,10 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
     A part seen from within, such as a room, is right with triangles that face its inside. False for parts that
     `warn_of_winding` leaves out.
     """
-    surface = _triangles_of(part)
-    if part.cull != "back" or surface is None:
+    surface = part.surface
+    if part.cull != "back" or not isinstance(surface, TriangleSurface):
+        return False
+    if surface.depends_on_view or not surface.proxy_is_cheap:
         return False
     known = known_tree((surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
     if known is None:
@@ -68,14 +60,6 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
     low, high = (f(proxy.vertices[proxy.faces], axis=(0, 1)) for f in (np.min, np.max))
     eye = np.linalg.inv(local.view)[:3, 3]
     return not ((low < eye) & (eye < high)).all() and _encloses_less_than_nothing(proxy.vertices, proxy.faces)
-
-
-def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
-    """The surface of a part, if its triangles are cheap and the same from every view; else None."""
-    surface = part.surface
-    if isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view:
-        return surface
-    return None
 
 
 def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool:

@@ -139,15 +139,7 @@ def fit_pose(
     residuals = _residuals(parts, camera, target, bounds, weights, engine_object, loss=loss, f_scale=f_scale)
     start = engine_object.constant(np.zeros(len(weights), np.float32))
     schedule = pyramid(target.shape, largest=LARGEST_SIDE)
-    result = fit(
-        residuals,
-        start,
-        method=method,
-        steps=steps,
-        schedule=schedule,
-        callback=note,
-        progress=progress,
-    )
+    result = fit(residuals, start, method=method, steps=steps, schedule=schedule, callback=note, progress=progress)
     solution = engine_object.to_numpy(result.parameters).astype(np.float64) * weights
     trail = [_pose(unknowns, bounds, camera, target.shape) for unknowns in (*_best_so_far(visited, result), solution)]
     return PoseFit(

@@ -291,11 +291,6 @@ class Sampled(_OnCells):
     stencil: Stencil | None = None
 
     @property
-    def one_part(self) -> bool:
-        """True for a scene of one part."""
-        return len(self.samples) == 1
-
-    @property
     def part(self) -> Array:
         """(K, H, W) int32, the part of the sample in each cell and layer, or −1."""
         xp, first = namespace(self.row), 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,12 @@ import numpy as np
 from rts.advice.unread_entries import Observed, likely_name, shaded_by, unread
 from rts.advice.winding import INSIDE_OUT, is_inside_out
 from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart, check_scene
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
-from rts.contracts.shader import FunctionShader
+from rts.contracts.shader import FunctionShader, Shader
+from rts.diagnostics.gradient_reasons.shader_steps import REMEDY, STEP, steps_inside
 from rts.fitting.targets import BRIGHTEST, largest
 from rts.registry import name_of
 from rts.rendering.arguments import Layers, SplatterLike
@@ -56,42 +59,62 @@ def explain(
 
     Returns:
         For each part the name of the `sampler`, the `reason`, and `remarks` on likely mistakes. With a size also the
-        number of `samples`, apron and those beside outlines included.
+        number of `samples`, apron and those beside outlines included, and a remark on a shader of your own whose
+        colours step, which has no derivative.
 
     Raises:
         InputError: the scene cannot be sampled.
     """
     checked, seen = check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
     sampled = None
-    shaded: list[Any] = [shaded_by(part) for part in checked]
+    watched: list[Any] = [None] * len(checked)
     if size is not None:
         sampled = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
-        if None in shaded:
-            seen_to_read = _observed(checked, camera, size)
-            shaded = [b if a is None else a for a, b in zip(shaded, seen_to_read, strict=True)]
+        if any(_is_own(part.shader) for part in checked):
+            watched = _watched(checked, camera, size)
     if isinstance(parts, Prepared):
         choices = [Choice(name_of("rts.samplers", sampler), PREPARED) for sampler in parts.samplers]
     else:
         choices = [choose(part, static=is_static(part, seen)) for part in checked]
-    remarks = [tuple(_remarks(part, seen, entries)) for part, entries in zip(checked, shaded, strict=True)]
+    remarks = [tuple(_remarks(part, seen, shader)) for part, shader in zip(checked, watched, strict=True)]
     choices = [choice._replace(remarks=lines) for choice, lines in zip(choices, remarks, strict=True)]
     if sampled is None:
         return choices
     return [choice._replace(samples=n) for choice, n in zip(choices, map(_count, sampled.samples), strict=True)]
 
 
-def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[set[str]]:
-    """The entries of θ that the shader of each part reads, as it shades a few samples."""
-    shaders = [Observed(part.shader) for part in parts]
+class _Watched(Observed):
+    """A wrapper of a shader that records the entries of θ that it reads, and whether its colours step on a surface."""
+
+    steps = False
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
+        """The colours of the wrapped shader."""
+        colors = super().__call__(theta, gbuffer, camera)
+        if _is_own(self._shader):
+            self.steps |= steps_inside(lambda between: self._shader(theta, between, camera), gbuffer, camera)
+        return colors
+
+
+def _is_own(shader: Shader) -> bool:
+    """True for a shader that is a function, or of another package; colours of built-in ones do not step."""
+    return not type(shader).__module__.startswith("rts.shading.")
+
+
+def _watched(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[_Watched]:
+    """The shaders of parts, watched as they shade a few samples."""
+    shaders = [_Watched(part.shader) for part in parts]
     watched = [part.replace(shader=shader) for part, shader in zip(parts, shaders, strict=True)]
-    small = min(size[0], FEW), min(size[1], FEW)
-    sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
-    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None), splatter="none")
-    return [shader.read for shader in shaders]
+    small, camera = (min(size[0], FEW), min(size[1], FEW)), camera.for_size(size).replace(aspect=None)
+    render_samples(sample(watched, camera, small, splatter=None, layers=1), watched, camera, splatter="none")
+    return shaders
 
 
-def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:
-    """Likely mistakes in a part; `shaded` are the entries of θ that its shader reads, None if unknown."""
+def _remarks(part: CheckedPart, camera: Camera, watched: _Watched | None) -> Iterator[str]:
+    """Likely mistakes in a part; `watched` is its shader, None if it was not watched."""
+    shaded = shaded_by(part)
+    if shaded is None and watched is not None:
+        shaded = watched.read
     for name in unread(part, shaded):
         meant = likely_name(part, name, shaded or ())
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
@@ -103,6 +126,8 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
             yield f"theta[{name!r}] goes up to {most:g}, where white is 1: divide colours from 0 to 255 by 255"
     if isinstance(part.shader, FunctionShader) and not hasattr(part.shader.function, "opaque"):
         yield NO_PROMISE
+    if watched is not None and watched.steps:
+        yield f"its colours step inside the surface, {STEP}; {REMEDY}"
 
 
 def _count(samples: Samples) -> int:

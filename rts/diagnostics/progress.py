@@ -21,20 +21,13 @@ def phases(wanted: bool | None) -> Iterator[Phase]:
     if not shows_bar(wanted):
         yield lambda what, steps: lambda: None
         return
+    from rich import progress as bars
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    left, taken = TimeRemainingColumn(), TimeElapsedColumn()
-    texts = [TextColumn(text) for text in ("{task.description}", "left,", "taken")]
-    columns = (texts[0], BarColumn(), MofNCompleteColumn(), left, texts[1], taken, texts[2])
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    left, taken = bars.TimeRemainingColumn(), bars.TimeElapsedColumn()
+    texts = [bars.TextColumn(text) for text in ("{task.description}", "left,", "taken")]
+    columns = (texts[0], bars.BarColumn(), bars.MofNCompleteColumn(), left, texts[1], taken, texts[2])
+    with bars.Progress(*columns, console=Console(stderr=True)) as bar:
 
         def phase(what: str, steps: int) -> Callable[[], None]:
             task = bar.add_task(what, total=steps)

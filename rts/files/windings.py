@@ -14,6 +14,10 @@ import numpy as np
 
 from rts.files.damaged_files import warn
 
+MOST = 0.8
+"""The share of a patch's faces from which they tell its sides, even if these are the inside of a closed patch: faces
+that are wound anyhow hardly ever agree so well."""
+
 
 class Wound(NamedTuple):
     """Faces that are kept, and those of them that are to be turned over.
@@ -64,9 +68,10 @@ def wound_alike(
     """The faces without repetitions, those of each patch wound alike; None if that changes nothing.
 
     A patch is what is joined by edges of two faces. One that is wound in different ways, or had faces of both
-    directions, is wound as its outside is, where it is closed, and else as most of its faces are; as the others are,
-    where these are alike, and few have both directions. Patches with one side only, as Möbius's strip, and such that
-    are wound alike, also with the inside out, stay as they are.
+    directions, is wound as `MOST` of its faces are, unless many have both directions: so a room that is seen from
+    inside stays one. Where there is no such majority, it is wound as its outside is, if it is closed, and else as more
+    of its faces are. Patches with one side only, as Möbius's strip, and such that are wound alike, also with the inside
+    out, stay as they are.
 
     Args:
         vertices: (V, 3) float.
@@ -90,7 +95,7 @@ def wound_alike(
     volume = np.bincount(patch, np.where(like_first, 1, -1) * _volumes(vertices, faces[kept], patch, count), count)
     # Faces of which the file has both directions have no vote.
     votes = np.bincount(patch, np.where(double, 0, np.where(like_first, 1, -1)), count)
-    agreed = (np.abs(votes) == np.bincount(patch, ~double, count)) & (2 * np.abs(votes) > size)
+    agreed = (np.abs(votes) > (2 * MOST - 1) * np.bincount(patch, ~double, count)) & (2 * np.abs(votes) > size)
     sign = np.where(2 * alike >= size, 1.0, -1.0)
     sign = np.where(closed & (volume != 0), np.sign(volume), sign)
     sign = np.where(agreed, np.sign(votes), sign)

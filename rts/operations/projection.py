@@ -59,15 +59,7 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 
 
 PROJECTION = Operation.of_loops(
-    "rts.projection",
-    _specification,
-    (2, 2),
-    _shape,
-    _loops,
-    _check,
-    differentiable=2,
-    packed=(1,),
-    packed_result=True,
+    "rts.projection", _specification, (2, 2), _shape, _loops, _check, differentiable=2, packed=(1,), packed_result=True
 )
 
 

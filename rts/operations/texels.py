@@ -105,15 +105,7 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 
 
 TEXELS = Operation.of_loops(
-    "rts.texels",
-    _specification,
-    (2, 2, 1),
-    _shape,
-    _loops,
-    _check,
-    differentiable=2,
-    packed=(1,),
-    packed_result=True,
+    "rts.texels", _specification, (2, 2, 1), _shape, _loops, _check, differentiable=2, packed=(1,), packed_result=True
 )
 """The operation of `texels`, on table (M, C), uv (N, 2), and numbers of images (N,), or (0,) where all are the first.
 

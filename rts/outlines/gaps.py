@@ -21,6 +21,10 @@ INNER = 0.1
 BESIDE = 0.05
 """Distance from a crossing, in cells, of the samples that tell how depths change."""
 
+ASIDE, ASIDE_HALVINGS = 0.02, 12
+"""Distance from a break, in cells, at which it is looked for once more, to tell the outline's direction, up to four
+times as far before or behind; and how often that interval is halved."""
+
 STEEP, RISE = 1.5, 0.1
 """Two layers of a part may be two surfaces if their depths differ by more than so many times the least difference
 beside them, plus this share of a cell's width."""
@@ -242,7 +246,7 @@ def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> t
         change.parts(near),
         joined,
         np.full((len(number), 4), -1, np.int32),
-        lines_of_crossing(slope),
+        np.where((near == 2)[:, None], lines_of_crossing(slope), _directions(found, gap[number], gaps, oracle)),
         cells_away(change.depth(near), oracle.width),
     )
     return breaks, change.stacks(near, points, beside)
@@ -287,6 +291,52 @@ def _intervals(
             _Intervals(hinted[ends], place[ends], np.ones(len(ends)), seen.at(ends), every.at(2 * len(n) + ends)),
         ]
     )
+
+
+def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """Unit directions (B, 2) of outlines at breaks, by where these are `ASIDE`; 0 where they are unknown.
+
+    Only where more than two are on the sides of a square of centres, and so it is not plain which belong together.
+
+    Args:
+        found: their intervals.
+        gap: (B, 3), see `Gaps`.
+        gaps: the lines of intervals.
+        oracle: the scene.
+    """
+    y, x, axis = gap.T
+    squares = (y + 1 - axis, x + axis), (y + 1, x + 1)
+    count = np.zeros((y.max(initial=0) + 2, x.max(initial=0) + 2), int)
+    for square in squares:
+        np.add.at(count, square, 1)
+    at = np.flatnonzero(np.maximum(count[squares[0]], count[squares[1]]) > 2)
+    direction = np.zeros((len(gap), 2))
+    if not len(at):
+        return direction
+    both, shift = found.at(np.tile(at, 2)), np.repeat([-ASIDE, ASIDE], len(at))
+    step = gaps.step[both.gap]
+    start = gaps.points(both.gap, (both.low + both.high) / 2) + shift[:, None] * step[:, ::-1]
+
+    def before(place: np.ndarray) -> np.ndarray:
+        seen = oracle.layers(start + place[:, None] * step)
+        return _unlike(seen, both.before) < _unlike(seen, both.behind)
+
+    low, high = np.full(len(shift), -4 * ASIDE), np.full(len(shift), 4 * ASIDE)
+    known = before(low) & ~before(high)
+    for _ in range(ASIDE_HALVINGS):
+        middle = (low + high) / 2
+        first = before(middle)
+        low, high = np.where(first, middle, low), np.where(first, high, middle)
+    # The mean of one or both sides; 0 where neither shows the outline.
+    known, change = known.reshape(2, -1), np.where(known, low / shift, 0.0).reshape(2, -1)
+    way = step[: len(at), ::-1] + (change.sum(0) / np.maximum(known.sum(0), 1))[:, None] * step[: len(at)]
+    direction[at] = (known.sum(0) > 0)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return direction
+
+
+def _unlike(a: Fronts, b: Fronts) -> np.ndarray:
+    """(M,) how far layers are from others, by depth; far where their parts differ."""
+    return np.where(a.part == b.part, np.abs(a.depth - b.depth), 1e30).sum(0)
 
 
 def cells_away(depth: np.ndarray, width: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.advice.coarse_coordinates import FAR
 from rts.arrays.argument_checks import one_line
 from rts.arrays.array_functions import shape_of
 from rts.arrays.engines import namespace
@@ -67,8 +68,6 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     return Proxy(vertices, faces, ids, corners, numbers, origin)
 
 
-FAR = 8.0
-"""Vertices are far from the origin if some coordinate is so many times as large as the box of all vertices."""
 LOOKED_AT = 64
 """Triangles of which a corner tells that most meshes are not far from the origin, evenly spaced."""
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts_backends.embree.enlarged_triangles import NEVER
-from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
+from rts_backends.exact_hits import look
+from rts_backends.triangles import depth_of, edge_values, to_corner
 
 # isort: split
 import numba  # After `loops`, which imports it where no signal interrupts.
@@ -76,25 +77,14 @@ def _pointer(typing_context, address):
 
 @compiled
 def _decide(t, state, work, vertices, faces):
-    """Test triangle `t` in float64: True if the ray hits it, and the hit's depth, else 0.
+    """Test triangle `t` in float64: True if the ray hits it, and the depth there.
 
     `state` holds the ray's numbers (see COUNT and the others). `work` (8, 4) holds `matrix` and `row` of `cast`, then
     room for three corners.
     """
-    matrix, row, corners = work[:4], work[4], work[5:]
-    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
-    to_corner(matrix, vertices, ia, corners, 0)
-    to_corner(matrix, vertices, ib, corners, 1)
-    to_corner(matrix, vertices, ic, corners, 2)
-    area = determinant(corners, 0, 1, 2)
-    if not (area * state[KEEP] > 0 or (state[KEEP] == 0 and area != 0)):
-        return False, 0.0
-    ea, eb, ec, inside = edge_values(corners, 0, 1, 2, state[PIXEL_X], state[PIXEL_Y])
-    total = ea + eb + ec
-    if not inside or not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
-        return False, 0.0
-    za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
-    return True, (ea * za + eb * zb + ec * zc) / total
+    x, y, keep = state[PIXEL_X], state[PIXEL_Y], state[KEEP]
+    hit, _, z, _, _ = look(t, x, y, work[:4], work[4], keep, vertices, faces, work[5:])
+    return hit, z
 
 
 @compiled

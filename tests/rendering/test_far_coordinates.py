@@ -151,6 +151,50 @@ def test_float32_far_away_warns_once(number):
     assert len([x for x in found if "subtract an origin" in str(x.message)]) == 1
 
 
+WIDE = 412_345.678
+"""The width of a torus, in metres, of which float32 keeps 1.6 cm, even from its middle."""
+
+
+def wide_scene(origin, pixel):
+    """A torus of float64, `WIDE`, around a point, and a camera above a vertex at its silhouette."""
+    vertices = VERTICES * WIDE / 2.8 + origin
+    above = vertices[0] + np.array([0, 0, WIDE])
+    camera = rts.Camera.orthographic(above, vertices[0], (0, 1, 0), height=64 * pixel, near=WIDE / 10, far=2 * WIDE)
+    return rts.Part(Mesh(FACES), {"vertices": vertices}, "silhouette"), camera
+
+
+@pytest.mark.parametrize("engine", ["numpy", "torch"])
+@pytest.mark.parametrize("origin", [0 * UTM, UTM], ids=["near", "far"])
+def test_float64_too_wide_for_float32_warns_once_of_its_rounding_in_pixels(origin, engine):
+    part, camera = wide_scene(origin, 0.05)
+    if engine == "torch":
+        part = part.replace(theta={"vertices": pytest.importorskip("torch").from_numpy(part.theta["vertices"])})
+    with pytest.warns(
+        InputWarning, match=r"of float64, .* 0.016 apart, .* 0.05 wide, .*cut it into several parts"
+    ) as x:
+        image = rts.render(part, camera, (64, 64))
+        rts.render(part, camera, (64, 64))
+    assert len([w for w in x if "cut it into" in str(w.message)]) == 1
+    assert image[..., 3].max() == 1 and image[..., 3].min() == 0
+
+
+def test_float64_that_is_wide_does_not_warn_where_pixels_are_wider_or_once_it_is_cut():
+    part, camera = wide_scene(UTM, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rts.render(part, camera, (64, 64))
+    part, camera = wide_scene(UTM, 0.05)
+    piece = 4 * (FACES[:, 0] // 32) + FACES[:, 0] % 16 // 4
+    parts = [part.replace(surface=Mesh(FACES[piece == i])) for i in range(64)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cut = rts.render(parts, camera, (64, 64))
+    exact = rts.render(*wide_scene(-VERTICES[0] * WIDE / 2.8, 0.05), (64, 64))
+    with pytest.warns(InputWarning, match="cut it into several parts"):
+        whole = rts.render(part, camera, (64, 64))
+    assert np.abs(cut - exact).max() < 0.05 < np.abs(whole - exact).max()
+
+
 def test_engine_in_float32_warns_of_a_far_transform():
     """A transform and a camera of float64 are rounded beside vertices of torch in float32."""
     torch = pytest.importorskip("torch")

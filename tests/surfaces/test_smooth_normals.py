@@ -7,8 +7,9 @@ from helpers import ALL, CAMERA, DIFFERENTIABLE, SIZE, arrays, gradient, icosphe
 import rts
 from rts import InputError
 from rts.compiling.threads import read_only
+from rts.errors import InputWarning
 from rts.testing import OperationConformance
-from rts_surfaces.smooth_normals import SMOOTH_NORMALS, smooth_normals, vertex_normals
+from rts_surfaces.smooth_normals import SMOOTH_NORMALS, smooth_normals, vertex_normals, warn_of_windings
 
 pytestmark = pytest.mark.sampling
 
@@ -156,3 +157,25 @@ def test_what_names_no_vertex_is_refused(target):
         given = arrays(target, [vertices, params.astype(vertices.dtype), named])
         with pytest.raises(InputError, match=f"not among {len(BALL)}; sample the mesh anew"):
             to_numpy(smooth_normals(*given, faces))
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_faces_wound_against_their_neighbours_are_warned_of_once_where_normals_are_read(target):
+    away = RNG.random(len(FACES)) < 0.5
+    faces = np.where(away[:, None], FACES[:, ::-1], FACES)
+    given = arrays(target, BALL)
+    part = mesh_part((given, faces), shader="lambert")
+    rts.render(part.replace(shader="silhouette"), CAMERA, SIZE)
+    rts.render(part.replace(theta={**part.theta, "normals": given}), CAMERA, SIZE)
+    with pytest.warns(InputWarning, match=r"across (4|5)\d% of the edges of a mesh .* wound against one another"):
+        rts.render(part, CAMERA, SIZE)
+    rts.render(part, CAMERA, SIZE)
+
+
+def test_double_faces_strips_with_one_side_and_single_faces_turned_over_are_not_warned_of():
+    around = np.arange(25)  # An odd number of triangles makes a strip with one side.
+    strip = np.stack([around, (around + 1) % 25, (around + 2) % 25], 1)
+    strip[1::2] = strip[1::2, ::-1]
+    single = np.concatenate([FACES[:1, ::-1], FACES[1:]])
+    for faces in (FACES, FACES[:, ::-1], DOUBLE, single, strip, FACES[:0]):
+        warn_of_windings(faces)

@@ -1,13 +1,16 @@
-"""Steps in shaders: colours of fixed samples that jump as a number moves, of which derivatives tell nothing."""
+"""Steps in shaders: colours that jump as a number moves, or from place to place, of which derivatives tell nothing."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, leaves
+from rts.contracts.gbuffer import GBuffer
 from rts.diagnostics.gradient_reasons import variants
 from rts.diagnostics.gradient_reasons.reasons import Finding
 from rts.diagnostics.gradient_reasons.slopes import Number
@@ -16,6 +19,7 @@ from rts.errors import RtsError
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.scene.camera import Camera
+from rts.shading.shaders import is_behind
 
 JUMP = 0.02
 """The least change of a colour that counts as a jump."""
@@ -25,6 +29,38 @@ REACHES = tuple(4.0**k for k in range(7))
 """How far numbers are moved that change nothing nearby, in steps."""
 STAYS = 0.5
 """A jump that keeps more than this share of its size in the last interval is a step; smooth colours keep hardly any."""
+HALVINGS = 20
+"""How often the way from one sample to the next is halved."""
+
+STEP = "by a comparison, where or rounding: a step has no derivative"
+REMEDY = "make it a ramp of about a pixel, such as a sigmoid, or an outline: triangles of two colours"
+"""The origin of a step, and the remedy, in words."""
+
+
+def steps_inside(shade: Callable[[GBuffer], Array], gbuffer: GBuffer, camera: Any) -> bool:
+    """True if the colours that `shade` gives step on the way from a sample to the next one in the G-buffer.
+
+    Attributes change evenly on the way. Samples of the two sides of a surface have none: outlines lie between them.
+    """
+    xp, place = namespace(gbuffer.like), 0 * gbuffer.like[:, :1]
+    behind = is_behind(gbuffer, camera) if {"normal", "face_normal"} & {*gbuffer.computed} else place
+
+    def at(place: Array) -> Array:
+        between = GBuffer()
+        for name in gbuffer:
+            between.defer(name, lambda x=name: gbuffer[x] + place * (xp.roll(gbuffer[x], -1, axis=0) - gbuffer[x]))
+        return shade(between)
+
+    def change(a: Array, b: Array) -> Array:
+        return xp.max(abs(a - b), axis=1, keepdims=True)
+
+    before, after = at(place), at(place + 1)
+    for k in range(HALVINGS):
+        between = at(place + 0.5 ** (k + 1))
+        first = change(before, between) >= change(between, after)
+        place = xp.where(first, place, place + 0.5 ** (k + 1))
+        before, after = xp.where(first, before, between), xp.where(first, between, after)
+    return bool(xp.any((behind == xp.roll(behind, -1, axis=0)) & (change(before, after) > JUMP)))
 
 
 def why_stepped(subject: Subject, number: Number, connect: bool = False, far: bool = False) -> Finding | None:
@@ -82,6 +118,5 @@ def why_stepped(subject: Subject, number: Number, connect: bool = False, far: bo
     seen = sampled.part[:, y, x]
     seen = subject.engine.to_numpy(seen) if subject.engine.owns(seen) else np.asarray(seen)
     parts = variants.names(sorted({int(part) for part in seen if part >= 0}), "or")
-    because = f"colours of {parts} step as it changes, by a comparison, where or rounding: a step has no derivative"
-    advice = "Make it a ramp of about a pixel, such as a sigmoid, or an outline: triangles of two colours."
-    return Finding("steps", because, advice, off.max(axis=-1) > JUMP)
+    because = f"colours of {parts} step as it changes, {STEP}"
+    return Finding("steps", because, f"{REMEDY.capitalize()}.", off.max(axis=-1) > JUMP)

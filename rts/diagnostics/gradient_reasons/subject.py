@@ -165,13 +165,7 @@ class Subject:
         return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
     def step(
-        self,
-        direction: Tree,
-        change: Change | None = None,
-        *,
-        connect: bool = False,
-        deep: bool = False,
-        **fixed: Any,
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **fixed: Any
     ) -> float | None:
         """The result of `pixel_step` for a changed scene: a factor of the direction, or None where nothing changes.
 
