@@ -22,12 +22,6 @@ def _point(place, x, y, along):
 
 
 @compiled(inline="always")
-def _corner(east, south):
-    """The corner of a square, clockwise from the upper left: 0 to 3."""
-    return 3 * south + east - 2 * (south and east)
-
-
-@compiled(inline="always")
 def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
     """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
     for r in range(4):
@@ -77,11 +71,11 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
             px, py = x + t * wx, y + t * wy
             right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
             below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
-            length[n, _corner(px >= 0.5, py >= 0.5)] += np.hypot(dx, dy)
             for k in range(4):
                 east, south = k == 1 or k == 2, k >= 2
                 height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
                 weight[n, k] += height * dx
+                length[n, k] += np.hypot(dx, dy) if (px >= 0.5) == east and (py >= 0.5) == south else 0.0
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
                     _add_flux(flux, s, k, i, (1 - 0.5 * t * abs(other)) * of_cell, rates, p, t, dx, dy)
@@ -167,13 +161,6 @@ def _behind(start, end, corner):
 
 
 @compiled
-def _lead_on(weight, e, start, end):
-    """Add a straight piece to the way of a ray, whose areas are row `e` of `weight`."""
-    for k in range(4):
-        weight[e, k] += _behind(start, end, k)
-
-
-@compiled
 def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
     """Make one hub of those whose rays alternate around a square, since lines to them cross.
 
@@ -207,9 +194,9 @@ def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
             start = corner[first + other, 0], corner[first + other, 1]
             end = corner[first + hub, 0], corner[first + hub, 1]
             for e in range(count):
-                if hubs[e] == other:
+                for k in range(4 if hubs[e] == other else 0):
                     hubs[e] = hub
-                    _lead_on(weight, e, start, end)
+                    weight[e, k] += _behind(start, end, k)
             last[hub] = max(last[hub], last[other])
         depth = found + 1
 
@@ -311,15 +298,12 @@ def _add_areas(
 
 
 @compiled
-def _add_fluxes(s, local, begin, end, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
+def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
     """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
     cell_of, sample_of, weight_of, colors_of = motions
     for j in range(8):
         k, e = j // 2, j % 2
-        y = square[s, 0] + (k >= 2)
-        if not begin <= y < end:
-            continue
-        cell = y * width + square[s, 1] + (k == 1 or k == 2)
+        cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
         tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
         before, behind = shown[tie, 0], shown[tie, 1]
         for r in range(4):
@@ -345,7 +329,7 @@ def add_squares(
     begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
     colors, motions,
 ):  # fmt: skip
-    """Add the entries of segments, square after square, in the cells of lines `begin` to `end`.
+    """Add the entries of segments, square after square, of the squares that have cells in lines `begin` to `end`.
 
     From each break on a square's sides a ray goes to a hub inside: the corner of its segment, or of the one that this
     ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops`.
@@ -353,12 +337,7 @@ def add_squares(
     Returns:
         The numbers of entries of colours, and of motions.
     """
-    width, most, first, n, m = fronts.shape[1], 1, 0, 0, 0
-    while first < len(square):
-        stop = first + 1
-        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
-            stop += 1
-        most, first = max(most, stop - first), stop
+    width, most, first, n, m = fronts.shape[1], len(square), 0, 0, 0  # Most of this room is not touched.
     sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
     order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
     region = np.empty(2 * most, np.int64)
@@ -367,7 +346,6 @@ def add_squares(
     at, area = np.empty(2 * most), np.empty(2 * most)
     flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
     ray, rates, leading, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
-    first = 0
     while first < len(square):
         stop, count = first + 1, 0
         while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
@@ -401,16 +379,12 @@ def add_squares(
             _fill_regions(count, order, hubs, region)
             for k in range(4):
                 y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
-                if not begin <= y < end:
-                    continue
                 own = y * width + x, fronts[y, x]
                 n = _add_areas(
                     count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, own, shown, colors, n
                 )  # fmt: skip
         for s in range(first, stop):
             if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(
-                    s, s - first, begin, end, flux, square, width, ties, beyond, shown, movers, moves, motions, m
-                )  # fmt: skip
+                m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
         first = stop
     return n, m

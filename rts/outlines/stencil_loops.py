@@ -5,58 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.compiling.threads import parallel
+from rts.compiling.threads import parallel, read_only
 from rts.outlines.areas_loops import add_squares
 
-BANDS, SEGMENTS = 8, 250
+BANDS, SEGMENTS = 8, 400
 """The most bands of lines whose entries are made at once, and the fewest segments of each. These are numbers of their
 own, so that results are the same for any number of threads."""
 
 
-@compiled
-def _weigh_breaks(near, slope, rows, inner, pair, stack, cells, shown, movers, moves):
-    """Fill in which samples tell the colours beside breaks, and which their motions.
-
-    Args:
-        near: (B,) of outlines.
-        slope: (B, 2, 2).
-        rows: (B, 2).
-        inner: (B, 2).
-        pair: (B, 2).
-        stack: (B, 2, K); K = 0 for one layer.
-        cells: the number of cells, whose composites come before those of `stack`.
-        shown: (B, 2) int32 to fill: the colours before and behind breaks, or −1.
-        movers: (B, 2) int32 to fill: the samples that breaks move with, or −1: the last ones, or a pair.
-        moves: (B, 2, 3, 2) to fill: motion of breaks along x and y, for motions (x, y, depth) of their two samples.
-    """
-    for b in range(len(near)):
-        paired = pair[b, 0] >= 0
-        for i in range(2):
-            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
-            if stack.shape[2] > 0:
-                shown[b, i] = cells + 2 * b + i if stack[b, i, 0] >= 0 else -1
-            movers[b, i] = pair[b, i] if paired else rows[b, i]
-        moves[b] = 0.0
-        if paired:
-            for i in range(2):
-                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
-            continue
-        if near[b] < 2:
-            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
-            continue
-        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
-        for a in range(2):
-            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
-            for i in range(2):
-                sign = share if i == 0 else -share
-                moves[b, i, 0, a] = -sign * slope[b, i, 0]
-                moves[b, i, 1, a] = -sign * slope[b, i, 1]
-                moves[b, i, 2, a] = sign
-
-
-@compiled(inline="always")
-def _fill_normals(gap, place, ties, normal):
-    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+@loop
+def _normals(gap, place, ties):
+    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    normal = np.empty((len(gap), 2))
     for b in range(len(gap)):
         normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
     for s in range(len(ties)):
@@ -74,6 +34,7 @@ def _fill_normals(gap, place, ties, normal):
         length = np.hypot(normal[b, 0], normal[b, 1])
         normal[b, 0] /= length
         normal[b, 1] /= length
+    return normal
 
 
 @compiled
@@ -81,8 +42,7 @@ def _former(gap, b, i, joined):
     """The cell (y, x) before the one on a side of a break, or the latter if it shows another surface; True if not."""
     right, down = gap[b, 2], 1 - gap[b, 2]
     y, x = gap[b, 0] + i * down, gap[b, 1] + i * right
-    step = 1 if i == 1 else -1
-    by, bx = y + step * down, x + step * right
+    by, bx = y + (2 * i - 1) * down, x + (2 * i - 1) * right
     inside = 0 <= by < joined.shape[1] and 0 <= bx < joined.shape[2]
     on = inside and joined[down, min(y, by), min(x, bx)]
     return (by, bx, True) if on else (y, x, False)
@@ -92,7 +52,7 @@ def _former(gap, b, i, joined):
 def _add_sides(
     begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, motions, n, m
 ):  # fmt: skip
-    """Add the entries of the surfaces on both sides of breaks, in the cells of lines `begin` to `end`; see `entries`.
+    """Add the entries of the surfaces on both sides of breaks with cells in lines `begin` to `end`; see `entries`.
 
     From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
@@ -111,30 +71,27 @@ def _add_sides(
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
         if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
             continue
-        ahead, step, further = nx * right + ny * (1 - right), right + (1 - right) * width, first_stack[b]
+        ahead, step, further = nx * right + ny * (1 - right), right + (1 - right) * width, fronts.size + first_stack[b]
         for i in range(2):
             last, way = shown[b, i], 1 - 2 * i
-            if not (ends[b, i] and last >= 0):
-                continue
             y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
             cell, here = y * width + x, fronts[y, x]
+            if not (ends[b, i] and last >= 0 and here >= 0):
+                continue
             next_ = cell + way * step
             length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
             inside, outside = min(length, 0.5), max(length - 0.5, 0.0)
             by, bx, on = _former(gap, b, i, joined)
             former, rate = fronts[by, bx], 1 / (1 + length) if on else 1 / max(length, 0.5)
-            if here < 0:
-                continue
-            own, others = begin <= cell // width < end, begin <= next_ // width < end
-            nearer = own * ahead * ahead * (0.125 - inside**2 / 2) if on else 0.0
-            farther = others * ahead * ahead * rate * outside**2 / 2
+            nearer = ahead * ahead * (0.125 - inside**2 / 2) if on else 0.0
+            farther = ahead * ahead * rate * outside**2 / 2
             for at, color, share in ((cell, here, nearer), (next_, last, farther)):
                 if share > 0 and former >= 0 and color != former:
                     cell_of[n], color_of[n], from_of[n], weight_of[n] = at, former, color, share
                     n += 1
             mine = inside / (length if length > 1e-6 else 1.0)
             across = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
-            shares = (cell, own * mine), (next_, others * (1 - mine))
+            shares = (cell, mine), (next_, 1 - mine)
             if stack.shape[2] > 0:
                 along = -0.5 * way * right, -0.5 * way * (1 - right)
                 m, further = _add_layers(b, i, stack, row, y, x, here, further, shares, across, along, motions, m)
@@ -197,30 +154,19 @@ def _add_motion(motions, m, cell, sample, share, moves, color, other):
 
 @compiled
 def _by_cells(cell, count, start, cells):
-    """The cells that have entries, in order; where those of each begin in `order`, and this, the order of entries.
-
-    All are among so many `cells` from the cell `start` on.
-    """
-    number, found, several = np.full(cells, -1, np.int32), np.empty(min(count, cells), np.int32), 0
+    """Where the entries of each of so many `cells` from `start` on begin in `order`, and this, the order of these."""
+    first, order = np.zeros(cells + 2, np.int64), np.empty(count, np.int64)
     for n in range(count):
-        if number[cell[n] - start] < 0:
-            number[cell[n] - start], found[several], several = several, cell[n], several + 1
-    found = np.sort(found[:several])
-    for i in range(several):
-        number[found[i] - start] = i
-    first, order = np.zeros(several + 1, np.int64), np.empty(count, np.int64)
+        if 0 <= cell[n] - start < cells:
+            first[cell[n] - start + 2] += 1
+    for i in range(cells):
+        first[i + 2] += first[i + 1]
     for n in range(count):
-        first[number[cell[n] - start] + 1] += 1
-    for i in range(several):
-        first[i + 1] += first[i]
-    for n in range(count):
-        at = number[cell[n] - start]
-        order[first[at]] = n
-        first[at] += 1
-    for i in range(several, 0, -1):
-        first[i] = first[i - 1]
-    first[0] = 0
-    return found, first, order
+        at = cell[n] - start + 1
+        if 0 < at <= cells:
+            order[first[at]] = n
+            first[at] += 1
+    return first, order[: first[cells]]
 
 
 @compiled(inline="always")
@@ -240,14 +186,13 @@ def _sorted_colors(colors, count, start, cells, fronts):
     regions fill the cell, and of a colour no more is taken than there is.
     """
     raw_cell, raw_color, raw_weight, raw_from = colors
-    found, first, order = _by_cells(raw_cell, count, start, cells)
+    first, order = _by_cells(raw_cell, count, start, cells)
     cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count)
-    most = 0
-    for i in range(len(found)):
-        most = max(most, first[i + 1] - first[i])
-    color, weight, front, n = np.empty(most + 1, np.int32), np.empty(most + 1), fronts.reshape(-1), 0
-    for i in range(len(found)):
-        own, several = front[found[i]], 1
+    color, weight, front, n = np.empty(count + 1, np.int32), np.empty(count + 1), fronts.reshape(-1), 0
+    for i in range(cells):
+        if first[i] == first[i + 1]:
+            continue
+        own, several = front[start + i], 1
         color[0], weight[0] = own, 1.0 if own >= 0 else 0.0
         for e in range(first[i], first[i + 1]):  # In the order of entries: areas before what is taken of them.
             entry, taken = order[e], raw_weight[order[e]]
@@ -262,7 +207,7 @@ def _sorted_colors(colors, count, start, cells, fronts):
         for e in range(several):
             share = max(weight[e], 0.0) - (1 if e == 0 and own >= 0 else 0)
             if share != 0 and color[e] >= 0:
-                cell_of[n], color_of[n], weight_of[n] = found[i], color[e], share
+                cell_of[n], color_of[n], weight_of[n] = start + i, color[e], share
                 n += 1
     return cell_of[:n], color_of[:n], weight_of[:n]
 
@@ -270,41 +215,56 @@ def _sorted_colors(colors, count, start, cells, fronts):
 @compiled
 def _sorted_motions(motions, count, start, cells):
     """Entries of motions by cell."""
-    cell, sample, weight, colors = motions
-    _, _, order = _by_cells(cell, count, start, cells)
-    cell_of, sample_of = np.empty(count, np.int32), np.empty(count, np.int32)
-    weight_of, colors_of = np.empty((count, 3)), np.empty((count, 2), np.int32)
-    for m in range(count):
-        entry = order[m]
-        cell_of[m], sample_of[m] = cell[entry], sample[entry]
-        colors_of[m, 0], colors_of[m, 1] = colors[entry, 0], colors[entry, 1]
-        for a in range(3):
-            weight_of[m, a] = weight[entry, a]
-    return cell_of, sample_of, weight_of, colors_of
+    _, order = _by_cells(motions[0], count, start, cells)
+    return motions[0][order], motions[1][order], motions[2][order], motions[3][order]
 
 
 @loop
-def _of_breaks(place, gap, near, slope, ends, rows, inner, pair, stack, ties, row):
-    """What entries say of breaks and of cells; arguments as of `entries`.
+def _of_breaks(near, slope, rows, inner, pair, stack, cells):
+    """Which samples tell the colours beside breaks, and which their motions; arguments as of `entries`.
 
     Returns:
-        The colour (H, W) of each cell, a sample or a composite, or −1; `shown`, `movers` and `moves` of
-        `_weigh_breaks`; unit normals (B, 2) of outlines; composites (B,) of each break's first further stack; and
-        stacks (R, K): two of each break, then further ones.
+        The colours (B, 2) before and behind breaks, or −1, of several layers those of composites after the ones of so
+        many `cells`; the samples (B, 2) that breaks move with, or −1: the last ones, or a pair; and the motion
+        (B, 2, 3, 2) of breaks along x and y, for motions (x, y, depth) of these two samples.
     """
-    count, layers, height, width = len(place), stack.shape[2], row.shape[1], row.shape[2]
-    shown, movers, moves = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), np.empty((count, 2, 3, 2))
-    normal, first_stack = np.empty((count, 2)), np.zeros(count, np.int32)
-    _weigh_breaks(near, slope, rows, inner, pair, stack, height * width, shown, movers, moves)
-    _fill_normals(gap, place, ties, normal)
-    fronts, r = row[0].copy(), 2 * count if layers > 0 else 0
-    stacks = np.empty((r * (1 + layers), layers), np.int32)
-    if layers > 0:
-        for y in range(height):
-            for x in range(width):
-                fronts[y, x] = y * width + x if row[0, y, x] >= 0 else -1
-    for b in range(count if layers > 0 else 0):
-        first_stack[b] = height * width + r
+    count = len(near)
+    shown, movers, moves = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), np.zeros((count, 2, 3, 2))
+    for b in range(count):
+        paired = pair[b, 0] >= 0
+        for i in range(2):
+            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
+            if stack.shape[2] > 0:
+                shown[b, i] = cells + 2 * b + i if stack[b, i, 0] >= 0 else -1
+            movers[b, i] = pair[b, i] if paired else rows[b, i]
+        if paired:
+            for i in range(2):
+                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
+            continue
+        if near[b] < 2:
+            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
+            continue
+        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
+        for a in range(2):
+            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
+            for i in range(2):
+                sign = share if i == 0 else -share
+                moves[b, i, 0, a] = -sign * slope[b, i, 0]
+                moves[b, i, 1, a] = -sign * slope[b, i, 1]
+                moves[b, i, 2, a] = sign
+    return shown, movers, moves
+
+
+@loop
+def _further_stacks(gap, ends, stack, row, shown):
+    """Stacks (R, K): two of each break, then those of cells in which one layer is a break's; arguments as of `entries`.
+
+    Also returns the number (B,) of each break's first of the latter.
+    """
+    layers, count, r = len(row), len(gap), 2 * len(gap)
+    stacks, first = np.empty((r * (1 + layers), layers), np.int32), np.empty(count, np.int32)
+    for b in range(count):
+        first[b] = r
         for i in range(2):
             y, x = gap[b, 0] + i * (1 - gap[b, 2]), gap[b, 1] + i * gap[b, 2]
             for k in range(layers):
@@ -314,7 +274,7 @@ def _of_breaks(place, gap, near, slope, ends, rows, inner, pair, stack, ties, ro
                 for other in range(layers):
                     stacks[r, other] = row[other, y, x] if other != k else stack[b, i, k]
                 r += 1
-    return fronts, shown, movers, moves, normal, first_stack, stacks[:r]
+    return stacks[:r], first
 
 
 @loop
@@ -322,7 +282,7 @@ def _in_lines(
     begin, end, place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row,
     fronts, shown, movers, moves, normal, first_stack,
 ):  # fmt: skip
-    """The entries in the cells of lines `begin` to `end`, without stacks; see `entries` and `_of_breaks`."""
+    """The entries in the cells of lines `begin` to `end`, without stacks; see `entries`."""
     segments, breaks, width = 0, 0, row.shape[2]
     for s in range(len(square)):
         segments += begin - 1 <= square[s, 0] < end
@@ -373,7 +333,12 @@ def entries(
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
     """
-    *of_breaks, stacks = _of_breaks(place, gap, near, slope, ends, rows, inner, pair, stack, ties, row)
+    fronts, cells, stacks, first_stack = row[0], row[0].size, np.empty((0, 0), np.int32), np.zeros_like(near)
+    shown, movers, moves = _of_breaks(near, slope, rows, inner, pair, stack, cells)
+    if stack.shape[2]:
+        fronts = np.where(fronts >= 0, np.arange(cells, dtype=np.int32).reshape(fronts.shape), np.int32(-1))
+        stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
+    of_breaks = read_only(fronts), shown, movers, moves, _normals(gap, place, ties), first_stack
     bands = min(BANDS, 1 + len(square) // SEGMENTS)
     lines = [0, *(int(square[len(square) * i // bands, 0]) for i in range(1, bands)), row.shape[1]]
     known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row

@@ -103,10 +103,8 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
     arrays, cells, rows = (*operands[1:], read_only(g), g_positions, g_rgba), math.prod(row.shape[1:]), row[row >= 0]
     used[rows] = True
-    if np.count_nonzero(used) == len(rows):  # No two cells add to the same sample.
-        parallel(loops.pull, cells, *arrays, work=15 * row.size)
-    else:
-        loops.pull(0, cells, *arrays)
+    # Cells that share a sample add to it one after the other.
+    parallel(loops.pull, cells, *arrays, work=15 * row.size if np.count_nonzero(used) == len(rows) else 0)
     loops.pull(cells, cells + len(stacks), *arrays)
 
 
