@@ -208,7 +208,7 @@ LOOPS = [
     ),
     Defect(
         "flux along y has the sign of that along x",
-        "rts/outlines/stencil_loops.py",
+        "rts/outlines/areas_loops.py",
         "flux[s, k, i, r, 1] -= rate * dx",
         "flux[s, k, i, r, 1] += rate * dx",
         "stencil edges edges_bodies",
@@ -222,7 +222,7 @@ LOOPS = [
     ),
     Defect(
         "outlines that end at another one move with it all the way",
-        "rts/outlines/stencil_loops.py",
+        "rts/outlines/areas_loops.py",
         "(1 - share if r == 1 else (share if r == 2 else 0.0))",
         "pull[h, r]",
         "stencil edges_meetings",

@@ -1,4 +1,4 @@
-"""The rule of found edges, pixel by pixel, in plain NumPy: for readers and tests. `stencil_loops` computes the same.
+"""The rule of found edges, pixel by pixel, in plain NumPy: for readers and tests. `areas_loops` computes the same.
 
     colour of a cell      Σ over the regions into which outlines cut it: area · mean colour beside the region
     derivative of it      Σ over outlines: ∫ v · n J ds, with v the motion of the outline and J the jump of colour there

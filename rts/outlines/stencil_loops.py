@@ -1,451 +1,22 @@
-"""The entries of a stencil, from outlines: areas of the polygons into which they cut pixels, and fluxes. Compiled."""
+"""The entries of a stencil, from outlines, in the order of cells. Compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel, read_only
+from rts.outlines.areas_loops import add_squares
 
-BORDER = 1e-3
-"""Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
-
-
-@compiled
-def _weigh_breaks(near, slope, rows, inner, pair, stack, cells, shown, movers, moves):
-    """Fill in which samples tell the colours beside breaks, and which their motions.
-
-    Args:
-        near: (B,) of outlines.
-        slope: (B, 2, 2).
-        rows: (B, 2).
-        inner: (B, 2).
-        pair: (B, 2).
-        stack: (B, 2, K); K = 0 for one layer.
-        cells: the number of cells, whose composites come before those of `stack`.
-        shown: (B, 2) int32 to fill: the colours before and behind breaks, or −1.
-        movers: (B, 2) int32 to fill: the samples that breaks move with, or −1: the last ones, or a pair.
-        moves: (B, 2, 3, 2) to fill: motion of breaks along x and y, for motions (x, y, depth) of their two samples.
-    """
-    for b in range(len(near)):
-        paired = pair[b, 0] >= 0
-        for i in range(2):
-            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
-            if stack.shape[2] > 0:
-                shown[b, i] = cells + 2 * b + i if stack[b, i, 0] >= 0 else -1
-            movers[b, i] = pair[b, i] if paired else rows[b, i]
-        moves[b] = 0.0
-        if paired:
-            for i in range(2):
-                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
-            continue
-        if near[b] < 2:
-            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
-            continue
-        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
-        for a in range(2):
-            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
-            for i in range(2):
-                sign = share if i == 0 else -share
-                moves[b, i, 0, a] = -sign * slope[b, i, 0]
-                moves[b, i, 1, a] = -sign * slope[b, i, 1]
-                moves[b, i, 2, a] = sign
+BANDS, SEGMENTS = 8, 400
+"""The most bands of lines whose entries are made at once, and the fewest segments of each. These are numbers of their
+own, so that results are the same for any number of threads."""
 
 
-@compiled(inline="always")
-def _place(x, y, side):
-    """A place on a square's sides, clockwise from the upper left corner, 0 to 4."""
-    if side == 0:
-        return x
-    if side == 1:
-        return 1 + y
-    return 3 - x if side == 2 else 4 - y
-
-
-@compiled(inline="always")
-def _point(place, x, y, along):
-    """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
-    x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
-    return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
-
-
-@compiled(inline="always")
-def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
-    """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
-    for r in range(4):
-        rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
-        flux[s, k, i, r, 0] += rate * dy
-        flux[s, k, i, r, 1] -= rate * dx
-
-
-@compiled(inline="always")
-def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
-    """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
-
-    Returns the place of the break on the sides.
-
-    Args:
-        flux: (N, 4, 2, 4, 2), to fill for segment s and jump i: for each cell and jump, weights of the motions, along x
-            and y, of the four breaks that pull.
-        weight: (N, 4), to fill row n: the areas of the cells' quarters that lie behind the ray, clockwise, but for a
-            constant.
-        length: (N, 4), to fill row n: the lengths of the ray in the quarters.
-        s: the segment.
-        i: the jump.
-        n: the row of `weight`.
-        side: the side.
-        border: width, in cells, beside borders of pixels in which both have a share.
-        ray: (3, 2), the break, a point between, and where the outlines meet.
-        rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
-        other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
-    """
-    sign, start = 1.0 if side < 2 else -1.0, _place(ray[0, 0], ray[0, 1], side)
-    for k in range(4):
-        low = 2.5 if k == 0 or k == 3 else 2.0
-        weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
-        length[n, k] = 0.0
-    for p in range(2):
-        x, y = ray[p, 0], ray[p, 1]
-        wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
-        a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
-        b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
-        for m in range(3):
-            begin, end = (0.0 if m == 0 else (min(a, b) if m == 1 else max(a, b))), 1.0
-            if m < 2:
-                end = min(a, b) if m == 0 else max(a, b)
-            dx, dy, t = (end - begin) * wx, (end - begin) * wy, (begin + end) / 2
-            if dx == 0 and dy == 0:
-                continue
-            px, py = x + t * wx, y + t * wy
-            right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
-            below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
-            for k in range(4):
-                east, south = k == 1 or k == 2, k >= 2
-                height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
-                weight[n, k] += height * dx
-                length[n, k] += np.hypot(dx, dy) if (px >= 0.5) == east and (py >= 0.5) == south else 0.0
-                of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
-                if of_cell != 0:
-                    own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
-                    _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
-                    _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
-    return start
-
-
-@compiled(inline="always")
-def _along(ax, ay, bx, by, x, y):
-    """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
-    dx, dy = bx - ax, by - ay
-    square = dx * dx + dy * dy
-    t = ((x - ax) * dx + (y - ay) * dy) / square if square > 0 else 0.0
-    t = min(max(t, 0.0), 1.0)
-    return t, (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
-
-
-@compiled(inline="always")
-def _fill_path(path, s, place, gap, square, ties, corner):
-    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
-    for e in range(2):
-        b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
-        path[2 * e, 0], path[2 * e, 1] = _point(place[b], x, y, gap[b, 2])
-    path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
-
-
-@compiled(inline="always")
-def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
-    """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
-
-    `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
-    """
-    t, own, share = 0.0, 1 + e, 0.0
-    if s != h:
-        x, y = path[1, 0], path[1, 1]
-        first, near = _along(of_hub[0, 0], of_hub[0, 1], of_hub[1, 0], of_hub[1, 1], x, y)
-        second, far = _along(of_hub[2, 0], of_hub[2, 1], of_hub[1, 0], of_hub[1, 1], x, y)
-        t, own = (first, 0) if near <= far else (second, 3)
-        share, _ = _along(path[0, 0], path[0, 1], path[2, 0], path[2, 1], x, y)
-    for a in range(2):
-        ray[0, a], ray[1, a], ray[2, a] = path[2 * e, a], path[1, a], of_hub[1, a]
-    for r in range(4):
-        rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
-        rates[0, 1, r] = pull[s, r] if s == h else (1 - share if r == 1 else (share if r == 2 else 0.0))
-        rates[1, 0, r] = t * pull[h, r] + (1 - t if r == own else 0.0)
-        rates[1, 1, r] = pull[h, r]
-
-
-@compiled
-def _fill_order(count, sides, at, breaks, order):
-    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start.
-
-    The first comes again at the end, so that each has one after it.
-    """
-    for e in range(count):
-        here = e
-        while here > 0:
-            other = order[here - 1]
-            after = at[other] > at[e] if at[other] != at[e] else (breaks[other] > breaks[e]) == (sides[e] < 2)
-            if not (sides[other] > sides[e] or (sides[other] == sides[e] and after)):
-                break
-            order[here] = other
-            here -= 1
-        order[here] = e
-    order[count] = order[0]
-
-
-@compiled
-def _behind(start, end, corner):
-    """The area of a cell's quarter that a straight piece adds to that behind a ray; see `_weigh_ray`."""
-    east, south, total = corner == 1 or corner == 2, corner >= 2, 0.0
-    (x, y), (wx, wy) = start, (end[0] - start[0], end[1] - start[1])
-    a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
-    b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
-    low, high = min(a, b), max(a, b)
-    for begin, stop in ((0.0, low), (low, high), (high, 1.0)):
-        t = (begin + stop) / 2
-        if (x + t * wx >= 0.5) == east:
-            total += min(max(y + t * wy - (0.5 if south else 0.0), 0.0), 0.5) * (stop - begin) * wx
-    return total
-
-
-@compiled
-def _lead_on(weight, e, start, end):
-    """Add a straight piece to the way of a ray, whose areas are row `e` of `weight`."""
-    for k in range(4):
-        weight[e, k] += _behind(start, end, k)
-
-
-@compiled
-def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
-    """Make one hub of those whose rays alternate around a square, since lines to them cross.
-
-    Rays of one go on, straight, to the other.
-
-    Args:
-        first: the first segment of the square.
-        count: number of rays.
-        order: the rays in order, clockwise.
-        hubs: the hub of each ray, counted in the square; changed.
-        corner: (S, 2), where hubs are.
-        weight: (N, 4), see `_add_areas`; changed.
-        last: room for a number a hub.
-        open_hubs: room for a number a hub.
-    """
-    for p in range(count):
-        last[hubs[order[p]]] = p
-    depth = 0
-    for p in range(count):
-        hub, found = hubs[order[p]], -1
-        while depth > 0 and last[open_hubs[depth - 1]] < p:
-            depth -= 1
-        for d in range(depth):
-            if open_hubs[d] == hub:
-                found = d
-        if found < 0:
-            open_hubs[depth], depth = hub, depth + 1
-            continue
-        for d in range(found + 1, depth):
-            other = open_hubs[d]
-            start = corner[first + other, 0], corner[first + other, 1]
-            end = corner[first + hub, 0], corner[first + hub, 1]
-            for e in range(count):
-                if hubs[e] == other:
-                    hubs[e] = hub
-                    _lead_on(weight, e, start, end)
-            last[hub] = max(last[hub], last[other])
-        depth = found + 1
-
-
-@compiled
-def _fill_regions(count, order, hubs, region):
-    """Fill `region`: for the piece of a square's sides behind each ray, in order, the number of the region there.
-
-    A region reaches from the piece between two rays to others, if these rays end at one hub and no ray of it lies
-    between.
-
-    Args:
-        count: number of rays.
-        order: the rays in order, clockwise.
-        hubs: the hub of each ray.
-        region: to fill.
-    """
-    for p in range(count):
-        region[p] = p
-    for p in range(count):
-        last = p - 1 if p > 0 else count - 1
-        before = last
-        while hubs[order[before]] != hubs[order[p]]:
-            before = before - 1 if before > 0 else count - 1
-        own, other = region[before], region[last]
-        for q in range(count):
-            region[q] = own if region[q] == other else region[q]
-
-
-@compiled
-def _add_areas(
-    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, own_color, shown, colors, n
-):  # fmt: skip
-    """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
-
-    The cell's own region is the one around its centre, and has the centre's colour, which counts by the whole cell
-    already. The others have a mean of the colours beside them, at the breaks where they begin and end; of several
-    outlines around a region each counts by its length in the quarter.
-
-    Args:
-        count: number of rays.
-        order: the rays in order, clockwise.
-        sides: the side of the square that each ray starts from.
-        breaks: the break that it starts from.
-        hubs: the hub of each ray.
-        region: see `_fill_regions`.
-        weight: (N, 4), the area of the cell's quarter behind each ray, clockwise, up to a constant.
-        length: (N, 4), the lengths of rays in the cells' quarters.
-        area: room for a number a region.
-        of_hub: room for two numbers a hub.
-        corner: the corner of the square, clockwise from the upper left: 0 to 3.
-        own_color: the cell's (flat) number, and the colour of its centre, or −1.
-        shown: (B, 2), see `_weigh_breaks`.
-        colors: cells (E,), colours (E,), weights (E,), and the colours (E,) that these are taken of, or −1: to fill
-            from `n` on.
-        n: number of entries so far.
-    """
-    cell_of, color_of, weight_of, from_of = colors
-    cell, centre = own_color
-    here = -1
-    for p in range(count):
-        area[p] = 0.0
-        here += sides[order[p]] < corner
-    own = region[here] if here >= 0 else region[count - 1]
-    for p in range(count):
-        area[region[p]] += weight[order[p], corner] - weight[order[p + 1], corner]
-    area[own] += 0.25
-    total = 0.0
-    for p in range(count):
-        area[p] = max(area[p], 0.0)
-        total += area[p]
-    # Where lines for outlines cross, what they take twice is shared out.
-    scale = 0.25 / total
-    if centre >= 0 and area[own] * scale != 0.25:
-        cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, centre, -1, area[own] * scale - 0.25
-        n += 1
-    for r in range(count):
-        if r == own or area[r] == 0:
-            continue
-        for p in range(2 * count):
-            of_hub[hubs[order[p // 2]]] = 0.0
-        total = 0.0
-        for p in range(2 * count):
-            ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
-            if region[p // 2] == r:
-                of_hub[hubs[ray], 0] += length[ray, corner] + 1e-9
-                of_hub[hubs[ray], 1] += 1
-                total += length[ray, corner] + 1e-9
-        for p in range(2 * count):
-            ray = order[(p + 1) // 2]
-            if region[p // 2] != r:
-                continue
-            share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
-            color = shown[breaks[ray], int((sides[ray] < 2) == (p % 2 == 0))]
-            if color >= 0:
-                cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, color, -1, share
-                n += 1
-    return n
-
-
-@compiled
-def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
-    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
-    cell_of, sample_of, weight_of, colors_of = motions
-    for j in range(8):
-        k, e = j // 2, j % 2
-        cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
-        tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-        before, behind = shown[tie, 0], shown[tie, 1]
-        for r in range(4):
-            x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
-            b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
-            if b < 0 or before == behind or (x == 0 and y == 0):
-                continue
-            for i in range(2):
-                of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
-                of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
-                of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
-                if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
-                    continue
-                cell_of[m], sample_of[m] = cell, movers[b, i]
-                weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
-                colors_of[m, 0], colors_of[m, 1] = before, behind
-                m += 1
-    return m
-
-
-@compiled
-def _add_squares(
-    place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves, colors, motions,
-):  # fmt: skip
-    """Add the entries of segments, square after square; see `entries`. Returns the numbers of both kinds.
-
-    From each break on a square's sides a ray goes to a hub inside: the corner of its segment, or of the one that this
-    ends at or crosses. Between the rays lie regions.
-    """
-    width, most, first, n, m = fronts.shape[1], 1, 0, 0, 0
-    while first < len(square):
-        stop = first + 1
-        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
-            stop += 1
-        most, first = max(most, stop - first), stop
-    sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
-    order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
-    region = np.empty(2 * most, np.int64)
-    last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
-    weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
-    at, area = np.empty(2 * most), np.empty(2 * most)
-    flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
-    ray, rates, leading, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
-    first = 0
-    while first < len(square):
-        stop, count = first + 1, 0
-        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
-            stop += 1
-        flux[: stop - first] = 0.0
-        for s in range(first, stop):
-            members[s - first] = 0
-        for s in range(first, stop):
-            members[s + hub[s] - first] += ties[s, 0] != ties[s, 1]
-        for s in range(first, stop):
-            if ties[s, 0] == ties[s, 1]:
-                continue
-            leader = s + hub[s]
-            both = members[leader - first] == 1 and ties[s, 1] >= 0
-            _fill_path(leading, leader, place, gap, square, ties, corner)
-            _fill_path(path, s, place, gap, square, ties, corner)
-            for e in range(2 if ties[s, 1] >= 0 else 1):
-                side, other = square_sides[s, e], 0.0
-                if both:
-                    other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
-                _fill_ray(leader, s, e, leading, path, pull, ray, rates)
-                at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
-                sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
-                count += 1
-        if count > 0:
-            _fill_order(count, sides, at, breaks, order)
-            _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
-            _fill_regions(count, order, hubs, region)
-            for k in range(4):
-                y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
-                own = y * width + x, fronts[y, x]
-                n = _add_areas(
-                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, own, shown, colors, n
-                )  # fmt: skip
-        for s in range(first, stop):
-            if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
-        first = stop
-    return n, m
-
-
-@compiled(inline="always")
-def _fill_normals(gap, place, ties, normal):
-    """Fill unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+@loop
+def _normals(gap, place, ties):
+    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    normal = np.empty((len(gap), 2))
     for b in range(len(gap)):
         normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
     for s in range(len(ties)):
@@ -463,6 +34,7 @@ def _fill_normals(gap, place, ties, normal):
         length = np.hypot(normal[b, 0], normal[b, 1])
         normal[b, 0] /= length
         normal[b, 1] /= length
+    return normal
 
 
 @compiled
@@ -470,8 +42,7 @@ def _former(gap, b, i, joined):
     """The cell (y, x) before the one on a side of a break, or the latter if it shows another surface; True if not."""
     right, down = gap[b, 2], 1 - gap[b, 2]
     y, x = gap[b, 0] + i * down, gap[b, 1] + i * right
-    step = 1 if i == 1 else -1
-    by, bx = y + step * down, x + step * right
+    by, bx = y + (2 * i - 1) * down, x + (2 * i - 1) * right
     inside = 0 <= by < joined.shape[1] and 0 <= bx < joined.shape[2]
     on = inside and joined[down, min(y, by), min(x, bx)]
     return (by, bx, True) if on else (y, x, False)
@@ -479,9 +50,9 @@ def _former(gap, b, i, joined):
 
 @compiled
 def _add_sides(
-    place, gap, ends, rows, stack, ties, joined, row, fronts, shown, stacks, colors, motions, n, m, r
+    begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, motions, n, m
 ):  # fmt: skip
-    """Add the entries of the surfaces on both sides of breaks; see `entries`. Returns the numbers of all kinds.
+    """Add the entries of the surfaces on both sides of breaks with cells in lines `begin` to `end`; see `entries`.
 
     From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
@@ -490,26 +61,28 @@ def _add_sides(
     the slope times its width.
 
     Of layers each moves by itself: what ends at the break along the normal, others along the gap.
+
+    Returns:
+        The numbers of entries of colours, and of motions.
     """
-    normal, width, cells = np.empty((len(gap), 2)), fronts.shape[1], fronts.size
-    _fill_normals(gap, place, ties, normal)
+    width = fronts.shape[1]
     cell_of, color_of, weight_of, from_of = colors
     for b in range(len(gap)):
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
-        ahead, step = nx * right + ny * (1 - right), right + (1 - right) * width
+        if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
+            continue
+        ahead, step, further = nx * right + ny * (1 - right), right + (1 - right) * width, fronts.size + first_stack[b]
         for i in range(2):
             last, way = shown[b, i], 1 - 2 * i
-            if not (ends[b, i] and last >= 0):
-                continue
             y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
             cell, here = y * width + x, fronts[y, x]
+            if not (ends[b, i] and last >= 0 and here >= 0):
+                continue
             next_ = cell + way * step
             length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
             inside, outside = min(length, 0.5), max(length - 0.5, 0.0)
             by, bx, on = _former(gap, b, i, joined)
             former, rate = fronts[by, bx], 1 / (1 + length) if on else 1 / max(length, 0.5)
-            if here < 0:
-                continue
             nearer = ahead * ahead * (0.125 - inside**2 / 2) if on else 0.0
             farther = ahead * ahead * rate * outside**2 / 2
             for at, color, share in ((cell, here, nearer), (next_, last, farther)):
@@ -521,17 +94,17 @@ def _add_sides(
             shares = (cell, mine), (next_, 1 - mine)
             if stack.shape[2] > 0:
                 along = -0.5 * way * right, -0.5 * way * (1 - right)
-                m, r = _add_layers(b, i, stack, row[:, y, x], here, cells, shares, across, along, stacks, motions, m, r)
+                m, further = _add_layers(b, i, stack, row, y, x, here, further, shares, across, along, motions, m)
                 continue
             for at, share in shares:
                 m = _add_motion(motions, m, at, rows[b, i], share, across, last, here)
                 m = _add_motion(motions, m, at, row[0, y, x], share, across, last, here)
-    return n, m, r
+    return n, m
 
 
 @compiled
-def _add_layers(b, i, stack, own, here, cells, shares, across, along, stacks, motions, m, r):
-    """Add the entries of motions of layers on a side of a break. Returns the numbers of these, and of stacks.
+def _add_layers(b, i, stack, row, y, x, here, further, shares, across, along, motions, m):
+    """Add the entries of motions of layers on a side of a break.
 
     The composite of a cell changes as that of a stack where one layer is that of the break.
 
@@ -539,30 +112,32 @@ def _add_layers(b, i, stack, own, here, cells, shares, across, along, stacks, mo
         b: the break.
         i: the side.
         stack: (B, 2, K).
-        own: (K,), the samples of the cell on this side.
+        row: (K, H, W).
+        y: the cell on this side.
+        x: likewise.
         here: the composite of this cell, which is its number.
-        cells: the number of cells, whose composites come before those of stacks.
+        further: the composite of the first of these stacks.
         shares: two cells, and what each has of the change.
         across: along x and y, by what layers move it that end at the break.
         along: likewise, of layers that go on.
-        stacks: to fill from `r` on.
         motions: to fill from `m` on.
         m: number of entries so far.
-        r: number of stacks so far, after those of breaks.
+
+    Returns:
+        The number of entries, and the composite of the first stack of the next side.
     """
-    for k in range(len(own)):
-        there, stays = stack[b, i, k], False
-        if own[k] == there:
+    for k in range(len(row)):
+        own, there, stays = row[k, y, x], stack[b, i, k], False
+        if own == there:
             continue
-        for other in range(len(own)):
+        for other in range(len(row)):
             stays |= stack[b, 1 - i, other] == there
-            stacks[r, other] = own[other] if other != k else there
         moves = along if stays else across
         for at, share in shares:
-            m = _add_motion(motions, m, at, own[k], share, moves, cells + r, here)
-            m = _add_motion(motions, m, at, there, share, moves, cells + r, here)
-        r += 1
-    return m, r
+            m = _add_motion(motions, m, at, own, share, moves, further, here)
+            m = _add_motion(motions, m, at, there, share, moves, further, here)
+        further += 1
+    return m, further
 
 
 @compiled(inline="always")
@@ -578,28 +153,20 @@ def _add_motion(motions, m, cell, sample, share, moves, color, other):
 
 
 @compiled
-def _by_cells(cell, count, cells):
-    """The cells that have entries, in order; where those of each begin in `order`, and this, the order of entries."""
-    number, found, several = np.full(cells, -1, np.int32), np.empty(min(count, cells), np.int32), 0
+def _by_cells(cell, count, start, cells):
+    """Where the entries of each of so many `cells` from `start` on begin in `order`, and this, the order of these."""
+    first, order = np.zeros(cells + 2, np.int64), np.empty(count, np.int64)
     for n in range(count):
-        if number[cell[n]] < 0:
-            number[cell[n]], found[several], several = several, cell[n], several + 1
-    found = np.sort(found[:several])
-    for i in range(several):
-        number[found[i]] = i
-    first, order = np.zeros(several + 1, np.int64), np.empty(count, np.int64)
+        if 0 <= cell[n] - start < cells:
+            first[cell[n] - start + 2] += 1
+    for i in range(cells):
+        first[i + 2] += first[i + 1]
     for n in range(count):
-        first[number[cell[n]] + 1] += 1
-    for i in range(several):
-        first[i + 1] += first[i]
-    for n in range(count):
-        at = number[cell[n]]
-        order[first[at]] = n
-        first[at] += 1
-    for i in range(several, 0, -1):
-        first[i] = first[i - 1]
-    first[0] = 0
-    return found, first, order
+        at = cell[n] - start + 1
+        if 0 < at <= cells:
+            order[first[at]] = n
+            first[at] += 1
+    return first, order[: first[cells]]
 
 
 @compiled(inline="always")
@@ -612,21 +179,20 @@ def _at(colors, several, color):
 
 
 @compiled
-def _sorted_colors(colors, count, fronts):
+def _sorted_colors(colors, count, start, cells, fronts):
     """Entries of colours by cell, one for each colour of a cell, without those of 0.
 
     In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts:
     regions fill the cell, and of a colour no more is taken than there is.
     """
     raw_cell, raw_color, raw_weight, raw_from = colors
-    found, first, order = _by_cells(raw_cell, count, fronts.size)
+    first, order = _by_cells(raw_cell, count, start, cells)
     cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count)
-    most = 0
-    for i in range(len(found)):
-        most = max(most, first[i + 1] - first[i])
-    color, weight, front, n = np.empty(most + 1, np.int32), np.empty(most + 1), fronts.reshape(-1), 0
-    for i in range(len(found)):
-        own, several = front[found[i]], 1
+    color, weight, front, n = np.empty(count + 1, np.int32), np.empty(count + 1), fronts.reshape(-1), 0
+    for i in range(cells):
+        if first[i] == first[i + 1]:
+            continue
+        own, several = front[start + i], 1
         color[0], weight[0] = own, 1.0 if own >= 0 else 0.0
         for e in range(first[i], first[i + 1]):  # In the order of entries: areas before what is taken of them.
             entry, taken = order[e], raw_weight[order[e]]
@@ -641,28 +207,103 @@ def _sorted_colors(colors, count, fronts):
         for e in range(several):
             share = max(weight[e], 0.0) - (1 if e == 0 and own >= 0 else 0)
             if share != 0 and color[e] >= 0:
-                cell_of[n], color_of[n], weight_of[n] = found[i], color[e], share
+                cell_of[n], color_of[n], weight_of[n] = start + i, color[e], share
                 n += 1
     return cell_of[:n], color_of[:n], weight_of[:n]
 
 
 @compiled
-def _sorted_motions(motions, count, cells):
+def _sorted_motions(motions, count, start, cells):
     """Entries of motions by cell."""
-    cell, sample, weight, colors = motions
-    _, _, order = _by_cells(cell, count, cells)
-    cell_of, sample_of = np.empty(count, np.int32), np.empty(count, np.int32)
-    weight_of, colors_of = np.empty((count, 3)), np.empty((count, 2), np.int32)
-    for m in range(count):
-        entry = order[m]
-        cell_of[m], sample_of[m] = cell[entry], sample[entry]
-        colors_of[m, 0], colors_of[m, 1] = colors[entry, 0], colors[entry, 1]
-        for a in range(3):
-            weight_of[m, a] = weight[entry, a]
-    return cell_of, sample_of, weight_of, colors_of
+    _, order = _by_cells(motions[0], count, start, cells)
+    return motions[0][order], motions[1][order], motions[2][order], motions[3][order]
 
 
 @loop
+def _of_breaks(near, slope, rows, inner, pair, stack, cells):
+    """Which samples tell the colours beside breaks, and which their motions; arguments as of `entries`.
+
+    Returns:
+        The colours (B, 2) before and behind breaks, or −1, of several layers those of composites after the ones of so
+        many `cells`; the samples (B, 2) that breaks move with, or −1: the last ones, or a pair; and the motion
+        (B, 2, 3, 2) of breaks along x and y, for motions (x, y, depth) of these two samples.
+    """
+    count = len(near)
+    shown, movers, moves = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), np.zeros((count, 2, 3, 2))
+    for b in range(count):
+        paired = pair[b, 0] >= 0
+        for i in range(2):
+            shown[b, i] = inner[b, i] if rows[b, i] >= 0 and inner[b, i] >= 0 else rows[b, i]
+            if stack.shape[2] > 0:
+                shown[b, i] = cells + 2 * b + i if stack[b, i, 0] >= 0 else -1
+            movers[b, i] = pair[b, i] if paired else rows[b, i]
+        if paired:
+            for i in range(2):
+                moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
+            continue
+        if near[b] < 2:
+            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
+            continue
+        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
+        for a in range(2):
+            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
+            for i in range(2):
+                sign = share if i == 0 else -share
+                moves[b, i, 0, a] = -sign * slope[b, i, 0]
+                moves[b, i, 1, a] = -sign * slope[b, i, 1]
+                moves[b, i, 2, a] = sign
+    return shown, movers, moves
+
+
+@loop
+def _further_stacks(gap, ends, stack, row, shown):
+    """Stacks (R, K): two of each break, then those of cells in which one layer is a break's; arguments as of `entries`.
+
+    Also returns the number (B,) of each break's first of the latter.
+    """
+    layers, count, r = len(row), len(gap), 2 * len(gap)
+    stacks, first = np.empty((r * (1 + layers), layers), np.int32), np.empty(count, np.int32)
+    for b in range(count):
+        first[b] = r
+        for i in range(2):
+            y, x = gap[b, 0] + i * (1 - gap[b, 2]), gap[b, 1] + i * gap[b, 2]
+            for k in range(layers):
+                stacks[2 * b + i, k] = stack[b, i, k]
+                if not (ends[b, i] and shown[b, i] >= 0 and row[0, y, x] >= 0) or row[k, y, x] == stack[b, i, k]:
+                    continue
+                for other in range(layers):
+                    stacks[r, other] = row[other, y, x] if other != k else stack[b, i, k]
+                r += 1
+    return stacks[:r], first
+
+
+@loop
+def _in_lines(
+    begin, end, place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row,
+    fronts, shown, movers, moves, normal, first_stack,
+):  # fmt: skip
+    """The entries in the cells of lines `begin` to `end`, without stacks; see `entries`."""
+    segments, breaks, width = 0, 0, row.shape[2]
+    for s in range(len(square)):
+        segments += begin - 1 <= square[s, 0] < end
+    for b in range(len(place)):
+        breaks += begin - 1 <= gap[b, 0] < end
+    most = 20 * segments + 4 * breaks
+    colors = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most, np.int32)
+    most = 64 * segments + 8 * breaks * len(row)
+    motions = np.empty(most, np.int32), np.empty(most, np.int32), np.empty((most, 3)), np.empty((most, 2), np.int32)
+    n, m = add_squares(
+        begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
+        colors, motions,
+    )  # fmt: skip
+    n, m = _add_sides(
+        begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, motions, n,
+        m,
+    )  # fmt: skip
+    start, cells = begin * width, (end - begin) * width
+    return *_sorted_colors(colors, n, start, cells, fronts), *_sorted_motions(motions, m, start, cells)
+
+
 def entries(
     place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
     joined, row,
@@ -692,29 +333,21 @@ def entries(
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
     """
-    count, segments, layers, (height, width) = len(place), len(square), stack.shape[2], joined.shape[1:]
-    cells = height * width
-    shown, movers = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32)
-    moves = np.empty((count, 2, 3, 2))
-    _weigh_breaks(near, slope, rows, inner, pair, stack, cells, shown, movers, moves)
-    fronts = row[0].copy()
-    if layers > 0:
-        for y in range(height):
-            for x in range(width):
-                fronts[y, x] = y * width + x if row[0, y, x] >= 0 else -1
-    stacks = np.empty((2 * count * (1 + layers) if layers > 0 else 0, layers), np.int32)
-    for b in range(count if layers > 0 else 0):
-        stacks[2 * b], stacks[2 * b + 1] = stack[b, 0], stack[b, 1]
-    most = 20 * segments + 8 * count
-    colors = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most, np.int32)
-    most = 64 * segments + 8 * count * max(layers, 1)
-    motions = np.empty(most, np.int32), np.empty(most, np.int32), np.empty((most, 3)), np.empty((most, 2), np.int32)
-    n, m = _add_squares(
-        place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves, colors, motions
-    )
-    r = 2 * count if layers > 0 else 0
-    n, m, r = _add_sides(
-        place, gap, ends, rows, stack, ties, joined, row, fronts, shown, stacks, colors, motions, n, m, r
-    )
-    of_colors, of_motions = _sorted_colors(colors, n, fronts), _sorted_motions(motions, m, cells)
-    return of_colors, of_motions, stacks[:r]
+    fronts, cells, stacks, first_stack = row[0], row[0].size, np.empty((0, 0), np.int32), np.zeros_like(near)
+    shown, movers, moves = _of_breaks(near, slope, rows, inner, pair, stack, cells)
+    if stack.shape[2]:
+        fronts = np.where(fronts >= 0, np.arange(cells, dtype=np.int32).reshape(fronts.shape), np.int32(-1))
+        stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
+    of_breaks = read_only(fronts), shown, movers, moves, _normals(gap, place, ties), first_stack
+    bands = min(BANDS, 1 + len(square) // SEGMENTS)
+    lines = [0, *(int(square[len(square) * i // bands, 0]) for i in range(1, bands)), row.shape[1]]
+    known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row
+    found = [()] * bands
+
+    def some(first, last):
+        for i in range(first, last):
+            found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_breaks)
+
+    parallel(some, bands, work=1500 * len(square))
+    columns = [x[0] if bands == 1 else np.concatenate(x) for x in zip(*found, strict=True)]
+    return columns[:3], columns[3:], stacks

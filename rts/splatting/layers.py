@@ -99,8 +99,13 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.splatting import layers_loops as loops
 
+    row, stacks, used = operands[2], operands[4], np.zeros(len(operands[0]), np.bool_)
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    loops.pull(*operands[1:], read_only(g), g_positions, g_rgba)
+    arrays, cells, rows = (*operands[1:], read_only(g), g_positions, g_rgba), math.prod(row.shape[1:]), row[row >= 0]
+    used[rows] = True
+    # Cells that share a sample add to it one after the other.
+    parallel(loops.pull, cells, *arrays, work=15 * row.size if np.count_nonzero(used) == len(rows) else 0)
+    loops.pull(cells, cells + len(stacks), *arrays)
 
 
 LAYERS = Operation("rts.layers", _specification, (2, 2, 3, 3, 2), _shape, _forward, _push, _pull, differentiable=2)

@@ -110,16 +110,18 @@ def _any(g, m):
 
 
 @loop
-def pull(rgba, row, joined, stacks, g, g_positions, g_rgba):
-    """Add to gradients of samples those of `g` (2 H · W + R, C); empty ones are not wanted."""
-    most, width, cells = len(row), row.shape[2], row.shape[1] * row.shape[2]
+def pull(first, last, rgba, row, joined, stacks, g, g_positions, g_rgba):
+    """Add to gradients of samples those of rows `first` to `last` of `g` (2 H · W + R, C); unless they are empty."""
+    most, width, cells = len(row), np.uint32(row.shape[2]), row.shape[1] * row.shape[2]
     samples, layers, through = np.empty(most, np.uint32), np.empty(most, np.uint32), np.empty(most)
     alpha, flat = rgba.shape[1] - 1, row.reshape((most, -1))
-    for m in range(cells + len(stacks)):
+    for cell in range(first, last):
+        m = np.uint32(cell)  # Compiled code need not check for negative ones.
         # What is behind a layer, times the gradient: all that is asked of it.
-        behind, moved_behind, moved = 0.0, 0.0, cells + len(stacks) + m
+        behind, moved_behind, moved = 0.0, 0.0, np.uint32(cells + len(stacks) + m)
         if m >= cells and not _any(g, m):  # Of most stacks the composite only tells how colours jump.
             continue
+        y, x = m // width, m % width
         for k in range(_weigh(rgba, flat, stacks, m, samples, layers, through) - 1, -1, -1):
             n, light = samples[k], through[k]
             passed, own, own_moved = 1 - rgba[n, alpha], 0.0, 0.0
@@ -130,7 +132,6 @@ def pull(rgba, row, joined, stacks, g, g_positions, g_rgba):
                 g_rgba[n, alpha] -= light * behind
                 behind = own + passed * behind
             if len(g_positions) and m < cells:
-                y, x = m // width, m % width
                 left, right = _beside(row, joined, layers[k], y, x, 0)
                 up, down = _beside(row, joined, layers[k], y, x, 1)
                 g_positions[n, 0] -= light * _slope(rgba, left, right, g, moved, moved_behind)

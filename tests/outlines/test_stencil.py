@@ -10,8 +10,9 @@ from mixed_scenes import mixed_of
 from soups import soup_of
 
 import rts
-from rts.outlines import reference, stacks
-from rts.outlines.stencil_loops import BORDER
+from rts.outlines import reference, stacks, stencil_loops
+from rts.outlines.areas_loops import BORDER
+from rts.outlines.found import FIELDS
 from rts.splatting.layers import composites
 from rts.splatting.stencil import splat
 
@@ -31,6 +32,18 @@ def sampled(parts, camera, size, **options):
 def mixed(number):
     scene = mixed_of(number)
     return sampled(scene.parts, scene.cameras[0], scene.size, layers=scene.layers, supersample=scene.supersample)
+
+
+@pytest.mark.parametrize("number", quick(range(12)))
+def test_bands_of_lines_have_the_entries_of_the_whole(number, monkeypatch):
+    monkeypatch.setattr(stencil_loops, "BANDS", 1)
+    whole, *_ = mixed(number)
+    monkeypatch.setattr(stencil_loops, "BANDS", 8)
+    monkeypatch.setattr(stencil_loops, "SEGMENTS", 3)
+    banded, *_ = mixed(number)
+    for name in FIELDS:
+        expected, found = (getattr(x.stencil, name) for x in (whole, banded))
+        np.testing.assert_array_equal(found, expected)
 
 
 def weights_of(stencil, front):

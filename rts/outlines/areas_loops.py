@@ -1,0 +1,390 @@
+"""Areas of the regions into which outlines cut squares of four centres, and fluxes of outlines that move. Compiled.
+
+The rule is in `reference`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled
+from rts.outlines.segments_loops import on_sides
+
+BORDER = 1e-3
+"""Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
+
+
+@compiled(inline="always")
+def _point(place, x, y, along):
+    """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
+    x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
+    return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
+
+
+@compiled(inline="always")
+def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
+    """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
+    for r in range(4):
+        rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
+        flux[s, k, i, r, 0] += rate * dy
+        flux[s, k, i, r, 1] -= rate * dx
+
+
+@compiled(inline="always")
+def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
+    """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
+
+    Returns the place of the break on the sides.
+
+    Args:
+        flux: (N, 4, 2, 4, 2), to fill for segment s and jump i: for each cell and jump, weights of the motions, along x
+            and y, of the four breaks that pull.
+        weight: (N, 4), to fill row n: the areas of the cells' quarters that lie behind the ray, clockwise, but for a
+            constant.
+        length: (N, 4), to fill row n: the lengths of the ray in the quarters.
+        s: the segment.
+        i: the jump.
+        n: the row of `weight`.
+        side: the side.
+        border: width, in cells, beside borders of pixels in which both have a share.
+        ray: (3, 2), the break, a point between, and where the outlines meet.
+        rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
+        other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
+    """
+    sign, start = 1.0 if side < 2 else -1.0, on_sides(ray[0, 0], ray[0, 1], side)
+    for k in range(4):
+        low = 2.5 if k == 0 or k == 3 else 2.0
+        weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
+        length[n, k] = 0.0
+    for p in range(2):
+        x, y = ray[p, 0], ray[p, 1]
+        wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
+        a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+        b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+        for m in range(3):
+            begin, end = (0.0 if m == 0 else (min(a, b) if m == 1 else max(a, b))), 1.0
+            if m < 2:
+                end = min(a, b) if m == 0 else max(a, b)
+            dx, dy, t = (end - begin) * wx, (end - begin) * wy, (begin + end) / 2
+            if dx == 0 and dy == 0:
+                continue
+            px, py = x + t * wx, y + t * wy
+            right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
+            below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+            for k in range(4):
+                east, south = k == 1 or k == 2, k >= 2
+                height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
+                weight[n, k] += height * dx
+                length[n, k] += np.hypot(dx, dy) if (px >= 0.5) == east and (py >= 0.5) == south else 0.0
+                of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
+                if of_cell != 0:
+                    _add_flux(flux, s, k, i, (1 - 0.5 * t * abs(other)) * of_cell, rates, p, t, dx, dy)
+                    if other != 0:
+                        _add_flux(flux, s, k, 1 - i, -0.5 * t * other * sign * of_cell, rates, p, t, dx, dy)
+    return start
+
+
+@compiled(inline="always")
+def _along(ax, ay, bx, by, x, y):
+    """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
+    dx, dy = bx - ax, by - ay
+    square = dx * dx + dy * dy
+    t = ((x - ax) * dx + (y - ay) * dy) / square if square > 0 else 0.0
+    t = min(max(t, 0.0), 1.0)
+    return t, (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
+
+
+@compiled(inline="always")
+def _fill_path(path, s, place, gap, square, ties, corner):
+    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
+    for e in range(2):
+        b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+        path[2 * e, 0], path[2 * e, 1] = _point(place[b], x, y, gap[b, 2])
+    path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
+
+
+@compiled(inline="always")
+def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
+    """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
+
+    `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
+    """
+    t, own, share = 0.0, 1 + e, 0.0
+    if s != h:
+        x, y = path[1, 0], path[1, 1]
+        first, near = _along(of_hub[0, 0], of_hub[0, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        second, far = _along(of_hub[2, 0], of_hub[2, 1], of_hub[1, 0], of_hub[1, 1], x, y)
+        t, own = (first, 0) if near <= far else (second, 3)
+        share, _ = _along(path[0, 0], path[0, 1], path[2, 0], path[2, 1], x, y)
+    for a in range(2):
+        ray[0, a], ray[1, a], ray[2, a] = path[2 * e, a], path[1, a], of_hub[1, a]
+    for r in range(4):
+        rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
+        rates[0, 1, r] = pull[s, r] if s == h else (1 - share if r == 1 else (share if r == 2 else 0.0))
+        rates[1, 0, r] = t * pull[h, r] + (1 - t if r == own else 0.0)
+        rates[1, 1, r] = pull[h, r]
+
+
+@compiled
+def _fill_order(count, sides, at, breaks, order):
+    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start.
+
+    The first comes again at the end, so that each has one after it.
+    """
+    for e in range(count):
+        here = e
+        while here > 0:
+            other = order[here - 1]
+            after = at[other] > at[e] if at[other] != at[e] else (breaks[other] > breaks[e]) == (sides[e] < 2)
+            if not (sides[other] > sides[e] or (sides[other] == sides[e] and after)):
+                break
+            order[here] = other
+            here -= 1
+        order[here] = e
+    order[count] = order[0]
+
+
+@compiled
+def _behind(start, end, corner):
+    """The area of a cell's quarter that a straight piece adds to that behind a ray; see `_weigh_ray`."""
+    east, south, total = corner == 1 or corner == 2, corner >= 2, 0.0
+    (x, y), (wx, wy) = start, (end[0] - start[0], end[1] - start[1])
+    a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+    b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+    low, high = min(a, b), max(a, b)
+    for begin, stop in ((0.0, low), (low, high), (high, 1.0)):
+        t = (begin + stop) / 2
+        if (x + t * wx >= 0.5) == east:
+            total += min(max(y + t * wy - (0.5 if south else 0.0), 0.0), 0.5) * (stop - begin) * wx
+    return total
+
+
+@compiled
+def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
+    """Make one hub of those whose rays alternate around a square, since lines to them cross.
+
+    Rays of one go on, straight, to the other.
+
+    Args:
+        first: the first segment of the square.
+        count: number of rays.
+        order: the rays in order, clockwise.
+        hubs: the hub of each ray, counted in the square; changed.
+        corner: (S, 2), where hubs are.
+        weight: (N, 4), see `_add_areas`; changed.
+        last: room for a number a hub.
+        open_hubs: room for a number a hub.
+    """
+    for p in range(count):
+        last[hubs[order[p]]] = p
+    depth = 0
+    for p in range(count):
+        hub, found = hubs[order[p]], -1
+        while depth > 0 and last[open_hubs[depth - 1]] < p:
+            depth -= 1
+        for d in range(depth):
+            if open_hubs[d] == hub:
+                found = d
+        if found < 0:
+            open_hubs[depth], depth = hub, depth + 1
+            continue
+        for d in range(found + 1, depth):
+            other = open_hubs[d]
+            start = corner[first + other, 0], corner[first + other, 1]
+            end = corner[first + hub, 0], corner[first + hub, 1]
+            for e in range(count):
+                for k in range(4 if hubs[e] == other else 0):
+                    hubs[e] = hub
+                    weight[e, k] += _behind(start, end, k)
+            last[hub] = max(last[hub], last[other])
+        depth = found + 1
+
+
+@compiled
+def _fill_regions(count, order, hubs, region):
+    """Fill `region`: for the piece of a square's sides behind each ray, in order, the number of the region there.
+
+    A region reaches from the piece between two rays to others, if these rays end at one hub and no ray of it lies
+    between.
+
+    Args:
+        count: number of rays.
+        order: the rays in order, clockwise.
+        hubs: the hub of each ray.
+        region: to fill.
+    """
+    for p in range(count):
+        region[p] = p
+    for p in range(count):
+        last = p - 1 if p > 0 else count - 1
+        before = last
+        while hubs[order[before]] != hubs[order[p]]:
+            before = before - 1 if before > 0 else count - 1
+        own, other = region[before], region[last]
+        for q in range(count):
+            region[q] = own if region[q] == other else region[q]
+
+
+@compiled
+def _add_areas(
+    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, own_color, shown, colors, n
+):  # fmt: skip
+    """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
+
+    The cell's own region is the one around its centre, and has the centre's colour, which counts by the whole cell
+    already. The others have a mean of the colours beside them, at the breaks where they begin and end; of several
+    outlines around a region each counts by its length in the quarter.
+
+    Args:
+        count: number of rays.
+        order: the rays in order, clockwise.
+        sides: the side of the square that each ray starts from.
+        breaks: the break that it starts from.
+        hubs: the hub of each ray.
+        region: see `_fill_regions`.
+        weight: (N, 4), the area of the cell's quarter behind each ray, clockwise, up to a constant.
+        length: (N, 4), the lengths of rays in the cells' quarters.
+        area: room for a number a region.
+        of_hub: room for two numbers a hub.
+        corner: the corner of the square, clockwise from the upper left: 0 to 3.
+        own_color: the cell's (flat) number, and the colour of its centre, or −1.
+        shown: (B, 2), see `_weigh_breaks`.
+        colors: cells (E,), colours (E,), weights (E,), and the colours (E,) that these are taken of, or −1: to fill
+            from `n` on.
+        n: number of entries so far.
+    """
+    cell_of, color_of, weight_of, from_of = colors
+    cell, centre = own_color
+    here = -1
+    for p in range(count):
+        area[p] = 0.0
+        here += sides[order[p]] < corner
+    own = region[here] if here >= 0 else region[count - 1]
+    for p in range(count):
+        area[region[p]] += weight[order[p], corner] - weight[order[p + 1], corner]
+    area[own] += 0.25
+    total = 0.0
+    for p in range(count):
+        area[p] = max(area[p], 0.0)
+        total += area[p]
+    # Where lines for outlines cross, what they take twice is shared out.
+    scale = 0.25 / total
+    if centre >= 0 and area[own] * scale != 0.25:
+        cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, centre, -1, area[own] * scale - 0.25
+        n += 1
+    for r in range(count):
+        if r == own or area[r] == 0:
+            continue
+        for p in range(2 * count):
+            of_hub[hubs[order[p // 2]]] = 0.0
+        total = 0.0
+        for p in range(2 * count):
+            ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
+            if region[p // 2] == r:
+                of_hub[hubs[ray], 0] += length[ray, corner] + 1e-9
+                of_hub[hubs[ray], 1] += 1
+                total += length[ray, corner] + 1e-9
+        for p in range(2 * count):
+            ray = order[(p + 1) // 2]
+            if region[p // 2] != r:
+                continue
+            share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
+            color = shown[breaks[ray], int((sides[ray] < 2) == (p % 2 == 0))]
+            if color >= 0:
+                cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, color, -1, share
+                n += 1
+    return n
+
+
+@compiled
+def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
+    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
+    cell_of, sample_of, weight_of, colors_of = motions
+    for j in range(8):
+        k, e = j // 2, j % 2
+        cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
+        tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
+        before, behind = shown[tie, 0], shown[tie, 1]
+        for r in range(4):
+            x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
+            b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
+            if b < 0 or before == behind or (x == 0 and y == 0):
+                continue
+            for i in range(2):
+                of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
+                of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
+                of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
+                if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
+                    continue
+                cell_of[m], sample_of[m] = cell, movers[b, i]
+                weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
+                colors_of[m, 0], colors_of[m, 1] = before, behind
+                m += 1
+    return m
+
+
+@compiled
+def add_squares(
+    begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
+    colors, motions,
+):  # fmt: skip
+    """Add the entries of segments, square after square, of the squares that have cells in lines `begin` to `end`.
+
+    From each break on a square's sides a ray goes to a hub inside: the corner of its segment, or of the one that this
+    ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops`.
+
+    Returns:
+        The numbers of entries of colours, and of motions.
+    """
+    width, most, first, n, m = fronts.shape[1], len(square), 0, 0, 0  # Most of this room is not touched.
+    sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
+    region = np.empty(2 * most, np.int64)
+    last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
+    weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
+    at, area = np.empty(2 * most), np.empty(2 * most)
+    flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
+    ray, rates, leading, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
+    while first < len(square):
+        stop, count = first + 1, 0
+        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
+            stop += 1
+        if not begin - 1 <= square[first, 0] < end:
+            first = stop
+            continue
+        flux[: stop - first] = 0.0
+        for s in range(first, stop):
+            members[s - first] = 0
+        for s in range(first, stop):
+            members[s + hub[s] - first] += ties[s, 0] != ties[s, 1]
+        for s in range(first, stop):
+            if ties[s, 0] == ties[s, 1]:
+                continue
+            leader = s + hub[s]
+            both = members[leader - first] == 1 and ties[s, 1] >= 0
+            _fill_path(leading, leader, place, gap, square, ties, corner)
+            _fill_path(path, s, place, gap, square, ties, corner)
+            for e in range(2 if ties[s, 1] >= 0 else 1):
+                side, other = square_sides[s, e], 0.0
+                if both:
+                    other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
+                _fill_ray(leader, s, e, leading, path, pull, ray, rates)
+                at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
+                sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
+                count += 1
+        if count > 0:
+            _fill_order(count, sides, at, breaks, order)
+            _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
+            _fill_regions(count, order, hubs, region)
+            for k in range(4):
+                y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
+                own = y * width + x, fronts[y, x]
+                n = _add_areas(
+                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, own, shown, colors, n
+                )  # fmt: skip
+        for s in range(first, stop):
+            if ties[s, 0] != ties[s, 1]:
+                m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
+        first = stop
+    return n, m
