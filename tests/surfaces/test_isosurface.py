@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from found_outlines import noted
-from helpers import ALL, DIFFERENTIABLE, arrays, gradient, relative_error, to_numpy
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, relative_error, to_numpy
 from lattices import BALL, BOUNDS, TORUS, ball, on_lattice, torus
 
 import rts
@@ -247,8 +247,10 @@ def glass(theta, gbuffer, camera):
     return xp.concat([gbuffer["normal"] / 3, xp.full_like(gbuffer["normal"][:, :1], 2 / 3)], axis=-1)
 
 
-@pytest.mark.parametrize("shader", ["normals", glass], ids=["opaque", "glass"])
-@pytest.mark.parametrize("target", [*ALL, "jax.jit"])
+@pytest.mark.parametrize(
+    ("target", "shader"),
+    [*((t, s) for t in ("numpy", *TORCH) for s in ("normals", glass)), ("jax", "normals"), ("jax.jit", glass)],
+)
 def test_samples_beside_outlines_are_joined_to_tables(target, shader):
     """Two parts, each with a table, alone and in two views: images and gradients are those without tables."""
     engine, weights = target.removesuffix(".jit"), np.random.default_rng(0).random((*SIZE, 4), np.float32)
