@@ -5,8 +5,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # Each takes up to 5 GB, most of it compiled jax programs.
 WORKERS ?= 2
-# Files keep their order: otherwise those of few tests, which take long, come last, and one worker waits for the other.
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# A worker takes tests that follow each other, and half of the other's last ones when it has none left.
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
@@ -36,7 +36,7 @@ test-all: warmup
 
 # jax as users have it: XLA improves programs, which elsewhere in the tests would take longer than it saves.
 test-xla: warmup
-	XLA_FLAGS= $(PYTEST) --dist load tests/backends/test_jax.py
+	XLA_FLAGS= $(PYTEST) tests/backends/test_jax.py
 
 # Distributions of their own that are built on the library, each with its tests.
 apps: warmup $(VENV)/.apps

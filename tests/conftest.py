@@ -8,8 +8,12 @@ import pytest
 # Idle threads of OpenMP otherwise spin, which on a busy machine makes small renders many times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# Most programs that tests have jax compile run once: to have LLVM improve them takes longer than it saves.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+# Most programs that tests have jax compile run once: to improve them takes longer than it saves. Without LLVM's passes
+# and XLA's emitters of fused loops, a program of one operation takes half the time.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -61,10 +61,11 @@ def to_numpy(tree):
     return map_leaves(lambda x: x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x), tree)
 
 
-def gradient(target, f, x):
-    """The gradient of a scalar function of a tree, on the host; by reverse mode."""
+def gradient(target, f, x, jit=True):
+    """The gradient of a scalar function of a tree, on the host; by reverse mode, by jax in a program if `jit`."""
     if target == "jax":
-        return to_numpy(pytest.importorskip("jax").grad(f)(x))
+        jax = pytest.importorskip("jax")
+        return to_numpy((jax.jit if jit else lambda f: f)(jax.grad(f))(x))
     torch = pytest.importorskip("torch")
     variables = []
 
@@ -77,10 +78,11 @@ def gradient(target, f, x):
     return to_numpy(map_leaves(lambda _: next(it), x))
 
 
-def derivative(target, f, x, dx):
-    """The value of `f` and its derivative along `dx`, on the host; by forward mode."""
+def derivative(target, f, x, dx, jit=True):
+    """The value of `f` and its derivative along `dx`, on the host; by forward mode, by jax in a program if `jit`."""
     if target == "jax":
-        return to_numpy(pytest.importorskip("jax").jvp(f, (x,), (dx,)))
+        jax = pytest.importorskip("jax")
+        return to_numpy((jax.jit if jit else lambda f: f)(lambda x, dx: jax.jvp(f, (x,), (dx,)))(x, dx))
     return to_numpy(pytest.importorskip("torch").func.jvp(f, (x,), (dx,)))
 
 

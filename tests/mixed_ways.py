@@ -139,9 +139,11 @@ def result_of(scene, way, view=0):
         if engine == "numpy":
             return images(still), None
         if "forward" in way:
-            image, push = derivative(engine, compiled(images), still, arrays(engine, _along(scene), np.float64))
+            image, push = derivative(
+                engine, compiled(images), still, arrays(engine, _along(scene), np.float64), jit=False
+            )
             return image, (push * to_numpy(weights)).sum()
-        slopes = gradient(engine, compiled(lambda values: (images(values) * weights).sum()), still)
+        slopes = gradient(engine, compiled(lambda values: (images(values) * weights).sum()), still, jit=False)
         return to_numpy(compiled(images)(still)), _flat(slopes)
 
 

@@ -50,7 +50,7 @@ assert all(p.ready for p in rts.plugins("engines", details=True))
 PYTHON
 NUMBA_CACHE_DIR=$(realpath "$venv")/numba
 export NUMBA_CACHE_DIR
-"$bin/python" -m pytest -n "${WORKERS:-2}" --dist loadfile -p no:cacheprovider -m "${MARKS:-(engines or files) and not thorough}"
+"$bin/python" -m pytest -n "${WORKERS:-2}" --dist worksteal -p no:cacheprovider -m "${MARKS:-(engines or files) and not thorough}"
 # A pose's fit, from far off: found, in torch and in jax.
 for engine in torch jax; do
     "$bin/python" -m rts demo -o "$venv/demo-$engine" --engine "$engine"

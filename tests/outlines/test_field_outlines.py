@@ -137,12 +137,17 @@ def test_outlines_shift_with_the_surface(name, way):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("way", ["sdf", "lattice"])
-def test_a_compiled_program_has_the_derivative_of_an_eager_one(way):
-    jax = pytest.importorskip("jax")
+def test_a_program_of_jax_has_the_derivative_of_torch(way):
+    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
     f, q, eye, _ = SHAPES["torus across"]
-    image, q, shift = coverage(f, eye, way, layers=2), jax.numpy.asarray(q), jax.numpy.full(3, SHIFT)
-    gradient = jax.grad(lambda q: (image(q, shift) * jax.numpy.arange(SIZE[1])).sum())
-    np.testing.assert_allclose(jax.jit(gradient)(q), gradient(q), rtol=1e-3)
+    image = coverage(f, eye, way, layers=2)
+
+    def moment(q, shift, across):
+        return (image(q, shift) * across).sum()
+
+    given = [np.asarray(x, np.float32) for x in (q, [SHIFT] * 3, np.arange(SIZE[1]))]
+    expected = torch.func.grad(moment)(*map(torch.tensor, given))
+    np.testing.assert_allclose(jax.jit(jax.grad(moment))(*map(jax.numpy.asarray, given)), expected, rtol=1e-3)
 
 
 # -------------------------------------------------------------------------------------------------- deepest points

@@ -146,7 +146,7 @@ def test_a_traced_function_of_jax_builds_once_for_a_hundred_poses(constant):
     assert np.abs(np.diff(images, axis=0)).max(axis=(1, 2, 3)).min() > 0
     matrix = jax.jit(jax.jacfwd(image))(many[0])
     assert matrix.shape == (*SIZE, 4, 6) and np.isfinite(matrix).all() and np.abs(matrix).max() > 0
-    batch = jax.vmap(image)(many[:5])
+    batch = jax.jit(jax.vmap(image))(many[:5])
     np.testing.assert_allclose(batch, images[:5], atol=1e-5)
     assert len(sampler.prepared) == 1
 

@@ -9,7 +9,7 @@ from test_edges_pairs import CAMERA
 
 import rts
 
-jax = pytest.importorskip("jax")
+jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
 jnp = jax.numpy
 
 pytestmark = pytest.mark.splatting
@@ -84,8 +84,8 @@ def test_every_kind_of_surface_is_found_in_a_program(surface, most):
     def drawn(pose):
         return rts.render(part.replace(transform=rts.rigid(pose)), CAMERA, SIZE, splatter="edges")
 
-    pose = jnp.asarray(0.3 * POSE)
-    np.testing.assert_allclose(jax.jit(drawn)(pose), drawn(pose), atol=most)
+    pose = np.float32(0.3 * POSE)
+    np.testing.assert_allclose(jax.jit(drawn)(jnp.asarray(pose)), drawn(torch.tensor(pose)), atol=most)
 
 
 @thorough

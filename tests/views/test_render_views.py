@@ -51,6 +51,14 @@ def looped(parts, cameras=CAMERAS, size=SIZE, **options):
     return np.stack([to_numpy(rts.render(parts, camera, size, **options)) for camera in cameras])
 
 
+def batched(target, f):
+    """`f` over a stack of its argument, by torch or in a program of jax."""
+    if target == "jax":
+        jax = pytest.importorskip("jax")
+        return jax.jit(jax.vmap(f))
+    return pytest.importorskip("torch").vmap(f)
+
+
 # ------------------------------------------------------------------------------------------- what a loop gives
 
 
@@ -184,15 +192,14 @@ def test_what_does_not_fit_is_left_out_of_its_own_view():
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_silhouettes_through_poses_cameras_and_batches_are_those_of_a_loop(target):
-    part = arrays(target, mesh_part(icosphere(1), shader="silhouette"))
+    part = mesh_part(icosphere(1), shader="silhouette")
+    expected, part = looped(part), arrays(target, part)
     stacked = arrays(target, Camera.stack([camera.for_size(SIZE) for camera in CAMERAS]))
-    expected = np.stack([to_numpy(rts.render(part, camera, SIZE)) for camera in stacked.unstack()])
     np.testing.assert_allclose(to_numpy(rts.render_views(part, stacked, SIZE)), expected, atol=2e-5)
 
-    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
     vertices = to_numpy(part.theta["vertices"])
     several = arrays(target, np.stack([vertices, 0.7 * vertices]))
-    together = vmap(lambda v: rts.render_views(part.replace(theta={"vertices": v}), stacked, SIZE))(several)
+    together = batched(target, lambda v: rts.render_views(part.replace(theta={"vertices": v}), stacked, SIZE))(several)
     np.testing.assert_allclose(to_numpy(together)[0], expected, atol=2e-5)
 
 
@@ -321,8 +328,7 @@ def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, m
         np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_several_parts_are_one_picture_with_jax_too(compiled):
+def test_several_parts_are_one_picture_in_programs_of_jax_too():
     jax = pytest.importorskip("jax")
     torch = pytest.importorskip("torch")
 
@@ -333,22 +339,20 @@ def test_several_parts_are_one_picture_with_jax_too(compiled):
     given = [part.theta["vertices"] for part in scene()]
     leaves = [torch.tensor(x, requires_grad=True) for x in given]
     expected = torch.autograd.grad(loss(leaves, torch.tensor(WEIGHTS)), leaves)
-    gradient_of = jax.grad(lambda x: loss(x, WEIGHTS))
-    found = (jax.jit(gradient_of) if compiled else gradient_of)(arrays("jax", given))
+    found = jax.jit(jax.grad(lambda x: loss(x, WEIGHTS)))(arrays("jax", given))
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_several_parts_in_a_batch_are_those_of_a_loop(target):
-    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
     parts, sizes = scene()[:2], np.float32([1.0, 0.7])
 
     def images(size):
         own = [part.replace(theta={"vertices": size * arrays(target, part.theta["vertices"])}) for part in parts]
         return rts.render_views(own, CAMERAS, SIZE)
 
-    found = to_numpy(vmap(images)(arrays(target, sizes)))
+    found = to_numpy(batched(target, images)(arrays(target, sizes)))
     for size, own in zip(sizes, found, strict=True):
         expected = looped([part.replace(theta={"vertices": size * part.theta["vertices"]}) for part in parts])
         np.testing.assert_allclose(own, expected, atol=2e-5)
@@ -442,10 +446,9 @@ def test_an_error_is_that_of_the_first_view_that_fails():
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_vmap_over_cameras_is_what_render_views_gives(target):
-    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
     part = arrays(target, mesh_part(icosphere(1), shader="normals"))
     stacked = arrays(target, Camera.stack([camera.for_size(SIZE) for camera in CAMERAS]))
-    found = vmap(lambda camera: rts.render(part, camera, SIZE))(stacked)
+    found = batched(target, lambda camera: rts.render(part, camera, SIZE))(stacked)
     np.testing.assert_allclose(to_numpy(found), to_numpy(rts.render_views(part, stacked, SIZE)), atol=2e-5)
 
 
