@@ -78,9 +78,9 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
                 length[n, k] += np.hypot(dx, dy) if (px >= 0.5) == east and (py >= 0.5) == south else 0.0
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
-                    _add_flux(flux, s, k, i, (1 - 0.5 * t * abs(other)) * of_cell, rates, p, t, dx, dy)
-                    if other != 0:
-                        _add_flux(flux, s, k, 1 - i, -0.5 * t * other * sign * of_cell, rates, p, t, dx, dy)
+                    own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
+                    _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
+                    _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
     return start
 
 
