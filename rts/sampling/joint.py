@@ -135,13 +135,16 @@ class Joint:
         return self._of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
 
     def _of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
-        """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row."""
-        samples, none, stop = [], np.asarray(0, np.int32), 0
+        """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row.
+
+        A single part has the cells of the image; several have a cell for each row.
+        """
+        samples, none, stop, whole = [], np.asarray(0, np.int32), 0, Cells(cells.row, cells.depth)
         for part, count in zip(self.parts, counts.tolist(), strict=True):
             start, stop = stop, stop + max(count, 1)
             used = np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count)
-            rows = ids[start:stop], params[start:stop]
-            samples.append(Samples(*rows, Cells(used), none, gbuffer_names=part.reads))
+            own = whole if len(counts) == 1 else Cells(used)
+            samples.append(Samples(ids[start:stop], params[start:stop], own, none, gbuffer_names=part.reads))
         return Sampled(tuple(samples), cells, none)
 
 

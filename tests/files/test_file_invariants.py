@@ -158,6 +158,7 @@ def vertices_in(lines):
 
 ENDS = st.sampled_from(["\n", "\r\n"]), st.booleans()
 GAPS = pytest.mark.filterwarnings("ignore:.*faces have no (texture coordinates|normals)")
+WOUND = pytest.mark.filterwarnings("ignore:across .* its triangles are wound against one another")
 
 
 @GAPS
@@ -254,6 +255,7 @@ def written(folder, kind, data):
     return path
 
 
+@WOUND
 @pytest.mark.parametrize("kind", FORMATS)
 @FEW
 @given(mesh=meshes())
@@ -270,6 +272,7 @@ def test_files_of_other_formats_give_their_triangles(folder, kind, mesh):
 PLACED = st.tuples(meshes(), steps(3, -2, 2), st.sampled_from([-2.0, 0.5, 1.0]))
 
 
+@WOUND
 @PROPERTIES
 @given(given=st.lists(PLACED, min_size=2, max_size=3))
 def test_the_meshes_of_a_scene_are_where_it_puts_them_also_when_they_are_merged(folder, given):
