@@ -162,6 +162,7 @@ WOUND = pytest.mark.filterwarnings("ignore:across .* its triangles are wound aga
 
 
 @GAPS
+@WOUND
 @MANY
 @given(obj=objs(), end=ENDS[0], last=ENDS[1])
 def test_an_obj_gives_its_triangles_however_it_is_written(folder, obj, end, last):
@@ -184,6 +185,7 @@ def test_an_obj_gives_its_triangles_however_it_is_written(folder, obj, end, last
 
 
 @GAPS
+@WOUND
 @PROPERTIES
 @given(obj=objs(), end=ENDS[0], last=ENDS[1])
 def test_merged_or_not_welded_the_triangles_of_an_obj_are_the_same(folder, obj, end, last):
@@ -199,6 +201,7 @@ def test_merged_or_not_welded_the_triangles_of_an_obj_are_the_same(folder, obj, 
 
 
 @GAPS
+@WOUND
 @PROPERTIES
 @given(obj=objs())
 def test_no_two_vertices_of_a_welded_mesh_are_the_same_and_all_are_used(folder, obj):
