@@ -14,14 +14,17 @@ from rts.plugin_api.operations import Operation, filled_up, interpolate, take
 CANCELLED = 1e-3
 """Sums over faces that are shorter than this share of what they add up are no directions; see `smooth_normals`."""
 
-LOOKED_AT, MIXED = 1 << 16, 0.05
+LOOKED_AT, MIXED = 1 << 14, 0.1
 """Faces of a mesh whose edges are looked at, and the share of these, of those that two faces share, from which the
 faces count as wound in different ways: a strip with one side only has a few such edges."""
 
 
 def warn_of_windings(faces: np.ndarray) -> None:
     """Warn of faces (T, 3) many of which are wound against their neighbours, so that sums of normals are no normals."""
-    start, end = faces[:LOOKED_AT].astype(np.int64), np.roll(faces[:LOOKED_AT], -1, axis=1)
+    turned = (faces[:LOOKED_AT].argmin(axis=1)[:, None] + np.arange(3)) % 3
+    # Those that are there twice, whichever corner comes first, cancel nothing.
+    faces = np.unique(np.take_along_axis(faces[:LOOKED_AT], turned, axis=1), axis=0).astype(np.int64)
+    start, end = faces, np.roll(faces, -1, axis=1)
     keys = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
     _, edge, count = np.unique(keys.reshape(-1), return_inverse=True, return_counts=True)
     same_way = np.abs(np.bincount(edge.reshape(-1), np.where(start < end, 1, -1).reshape(-1)))[count == 2] == 2

@@ -100,19 +100,33 @@ class Observed(Shader):
         return self._shader(_Noting(theta, self.read), gbuffer, camera)
 
 
-class _Noting(Mapping):
-    """Entries; every name that is looked up, present or not, is added to `read`, and all names by iteration."""
+class _Noting(dict):
+    """A dict that adds to `read` every name looked up, present or not; iteration adds all names."""
 
     def __init__(self, entries: Mapping[str, Any], read: set[str]):
-        self._entries, self._read = entries, read
+        super().__init__(entries)
+        self._read = read
 
     def __getitem__(self, name: str) -> Any:
+        self._read.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
         self._read.add(str(name))
-        return self._entries[name]
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
 
     def __iter__(self) -> Iterator[str]:
-        self._read.update(self._entries)
-        return iter(self._entries)
+        self._read.update(super().__iter__())
+        return super().__iter__()
 
-    def __len__(self) -> int:
-        return len(self._entries)
+    def keys(self) -> Any:
+        return dict.fromkeys(self).keys()
+
+    def items(self) -> Any:
+        return {name: self[name] for name in self}.items()
+
+    def values(self) -> Any:
+        return dict(self.items()).values()

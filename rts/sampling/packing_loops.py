@@ -21,8 +21,8 @@ def pack(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Rows for some cells, part after part, and those of a part layer by layer.
 
-    A part without cells has one row, in the middle of its first triangle. Cells without a row have −1 and 0. They are
-    those that are not taken, and those beyond the capacity.
+    A part without cells has one row, in the middle of its first triangle; zeros if it has no triangles. Cells without a
+    row have −1 and 0. They are those that are not taken, and those beyond the capacity.
 
     Args:
         fragments: (K, H, W), whose triangles are counted over all parts.
@@ -47,7 +47,7 @@ def pack(
     rows, width = np.maximum(counts, 1), 2 if corner_params is None else corner_params.shape[2]
     total = capacity or int(rows.sum())
     ahead = np.cumsum(ahead, axis=0) - ahead + np.cumsum(rows) - rows
-    make = np.zeros if capacity else np.empty
+    make = np.zeros if capacity or not len(table) else np.empty
     ids, params = make((total, table.shape[1]), np.int32), make((total, width), np.float32)
     for part in np.flatnonzero(counts == 0) if len(table) and not capacity else ():
         first = rows[:part].sum()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, CAMERA, SIZE, arrays, icosphere
+from helpers import ALL, CAMERA, SIZE, arrays, box, icosphere
 
 import rts
 
@@ -81,3 +81,25 @@ def test_sides_of_a_surface_may_have_colours_of_their_own():
     shown = rts.render(part, camera, SIZE)
     assert shown[..., 0].max() > 0.9 < shown[..., 1].max()
     assert rts.explain(part, camera, SIZE)[0].remarks == ()
+
+
+def test_colours_that_go_on_along_each_wall_of_a_room_do_not_step():
+    """Between walls that face one another, and through the inside of a solid, no colour is seen."""
+    corners, faces = box(1.0)
+    walls = corners[faces].reshape(-1, 3).astype(np.float32)  # No vertices in common: flat normals.
+    part = rts.Part(rts.Mesh(np.arange(len(walls)).reshape(-1, 3)), {"vertices": walls}, shader_of(SMOOTH["normals"]))
+    camera = rts.Camera.look_at((0.23, 0.11, 0.8), (0, 0, 0), fov_y=70)
+    assert rts.explain(part, camera, SIZE)[0].remarks == ()
+    inside = shader_of(lambda xp, g, camera, theta: where(xp, (g["position"] ** 2).sum(1)[:, None] < 0.5 * 0.49))
+    theta = {"vertices": BALL, "uv": 0 * BALL[:, :2]}
+    assert rts.explain(rts.Part(rts.Mesh(FACES), theta, inside), CAMERA, SIZE)[0].remarks == ()
+
+
+def test_shaders_may_take_theta_for_the_dict_that_it_is():
+    def shader(theta, gbuffer, camera):
+        assert isinstance(theta, dict)
+        mixed = theta.copy() | {"tint": np.float32(0.5)}
+        return 0 * gbuffer["position"][:, :1] + mixed["tint"] * np.ones(4, np.float32)
+
+    part = rts.Part(rts.Mesh(FACES), {"vertices": BALL}, shader)
+    assert all("step" not in remark for remark in rts.explain(part, CAMERA, SIZE)[0].remarks)

@@ -58,6 +58,13 @@ class Ball(rts.TriangleSurface):
         return GBuffer(position=samples.params * theta["radius"])
 
 
+def test_without_triangles_the_one_row_is_zeros(monkeypatch):
+    fragments = Fragments(np.full((1, 2, 2), -1, np.int32), np.zeros((1, 2, 2, 2)), np.zeros((1, 2, 2)))
+    monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, 7, dtype))
+    samples = pack_fragments(fragments, Proxy(np.zeros((3, 3)), np.zeros((0, 3), np.int32)))
+    assert (samples.ids == 0).all() and samples.ids.shape == (1, 3) and (samples.row == -1).all()
+
+
 @pytest.mark.parametrize("sampler", TRIANGLE_SAMPLERS)
 def test_refined_samples_lie_on_the_true_surface_and_in_the_centres_of_their_pixels(sampler):
     if sampler == "opengl":

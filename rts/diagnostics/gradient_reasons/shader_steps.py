@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import namespace
+from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array, leaves
 from rts.contracts.gbuffer import GBuffer
 from rts.diagnostics.gradient_reasons import variants
@@ -29,6 +29,8 @@ REACHES = tuple(4.0**k for k in range(7))
 """How far numbers are moved that change nothing nearby, in steps."""
 STAYS = 0.5
 """A jump that keeps more than this share of its size in the last interval is a step; smooth colours keep hardly any."""
+CLOSE = 4
+"""Samples are close together up to so many times the median distance from one to the next."""
 HALVINGS = 20
 """How often the way from one sample to the next is halved."""
 
@@ -40,10 +42,16 @@ REMEDY = "make it a ramp of about a pixel, such as a sigmoid, or an outline: tri
 def steps_inside(shade: Callable[[GBuffer], Array], gbuffer: GBuffer, camera: Any) -> bool:
     """True if the colours that `shade` gives step on the way from a sample to the next one in the G-buffer.
 
-    Attributes change evenly on the way. Samples of the two sides of a surface have none: outlines lie between them.
+    Attributes change evenly on the way. Only samples that lie close together have one, and not those of the two sides
+    of a surface, or whose normals point away from one another: the surface does not go on evenly between them.
     """
     xp, place = namespace(gbuffer.like), 0 * gbuffer.like[:, :1]
-    behind = is_behind(gbuffer, camera) if {"normal", "face_normal"} & {*gbuffer.computed} else place
+    position, normal = gbuffer["position"], {"normal", "face_normal"} & {*gbuffer.computed}
+    apart = _known(xp.sum((xp.roll(position, -1, axis=0) - position) ** 2, axis=1))
+    goes_on = apart <= CLOSE**2 * np.median(apart)
+    if normal:
+        behind, normals = _known(is_behind(gbuffer, camera))[:, 0], _known(gbuffer["normal"])
+        goes_on &= (behind == np.roll(behind, -1)) & ((normals * np.roll(normals, -1, axis=0)).sum(1) > 0)
 
     def at(place: Array) -> Array:
         between = GBuffer()
@@ -60,7 +68,14 @@ def steps_inside(shade: Callable[[GBuffer], Array], gbuffer: GBuffer, camera: An
         first = change(before, between) >= change(between, after)
         place = xp.where(first, place, place + 0.5 ** (k + 1))
         before, after = xp.where(first, before, between), xp.where(first, between, after)
-    return bool(xp.any((behind == xp.roll(behind, -1, axis=0)) & (change(before, after) > JUMP)))
+    return bool((goes_on & (_known(change(before, after))[:, 0] > JUMP)).any())
+
+
+def _known(x: Array) -> np.ndarray:
+    """The value of an array that is not traced."""
+    value = value_of(x)
+    assert value is not None
+    return value
 
 
 def why_stepped(subject: Subject, number: Number, connect: bool = False, far: bool = False) -> Finding | None:
