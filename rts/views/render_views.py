@@ -61,9 +61,10 @@ def render_views(
     meshes these are. Other views of one scene are sampled one by one. Other scenes are rendered one after another; so
     are all with `layers="auto"`, but not with "edges" where all is opaque, and if images are rendered in bands.
 
-    With jax, and under `torch.func`, scenes are rendered one after another. Views of one scene share a picture only if
-    all fit into one, and if each shader takes views or gives one colour. NumPy views that are too large for a picture
-    are rendered one on each core. With torch and jax all views are in memory at once, with a gradient or without.
+    With jax, and under `torch.func`, scenes are rendered one after another. Views of one scene share a picture only by
+    "edges", if all fit into one, and if each shader takes views or gives one colour. NumPy views that are too large for
+    a picture, or drawn by another splatter, are rendered one on each core. With torch and jax all views are in memory
+    at once, with a gradient or without.
 
     Args:
         parts: as in `render`, of one scene for all views; or a list of B scenes, each a list of parts or the result of
