@@ -101,7 +101,7 @@ def names(crossings: list[Crossing]) -> list[str]:
 
 
 NUMBERS = "matrices and single numbers"
-_OF_SAMPLES = ("ids", "barycentrics", "row", "depth", "triangle")
+_OF_SAMPLES = ("ids", "barycentrics", "row", "depth")
 _OF_STENCIL = ("joined", "cells of colours", "colours", "weights of colours")
 _OF_STENCIL += ("cells of motions", "motions", "weights of motions", "colours of motions")
 ORDER = {

@@ -125,6 +125,8 @@ def test_hessian_is_that_of_torch(jax, scene):
     options: dict = {"xla_backend_optimization_level": 1, "xla_disable_hlo_passes": "fusion"}
     if jax.__version_info__ < (0, 8):  # jax 0.5.3 refuses the second.
         del options["xla_disable_hlo_passes"]
+    else:  # Without these, which other tests do without, XLA's other emitters compile it wrongly.
+        options["xla_cpu_use_fusion_emitters"] = True
     hessian = jax.hessian(lambda e: loss_of("jax")(with_eye(scene, e), **SIMPLE))
     found = jax.jit(hessian, compiler_options=options)(eye)
     scene = arrays("torch-cpu", SCENE)
