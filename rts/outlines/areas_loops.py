@@ -337,7 +337,10 @@ def add_squares(
     Returns:
         The numbers of entries of colours, and of motions.
     """
-    width, most, first, n, m = fronts.shape[1], len(square), 0, 0, 0  # Most of this room is not touched.
+    width, most, stop, first, n, m = fronts.shape[1], 1, 0, 0, 0, 0
+    for s in range(1, len(square)):  # The most segments of one square.
+        stop = stop if square[s, 0] == square[stop, 0] and square[s, 1] == square[stop, 1] else s
+        most = max(most, s + 1 - stop)
     sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
     order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
     region = np.empty(2 * most, np.int64)

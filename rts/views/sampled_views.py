@@ -22,7 +22,7 @@ class Views(NamedTuple):
         sampled: the samples, on the grid of the picture; the apron is that of each view. In the table of a part the
             samples of one view stand together, in the order of the views. Parts have a cell for each row.
         picture: the layout of the views.
-        view: for each part (N,) int32, the number of each row's view, from 1 on; 0 for unused rows.
+        view: for each part (N,) int32, the number of each row's view, from 1 on.
         counts: for each part (B,), the number of rows of each view; None if unknown, as in traced programs.
     """
 
