@@ -48,7 +48,8 @@ def steps_inside(shade: Callable[[GBuffer], Array], gbuffer: GBuffer, camera: An
     xp, place = namespace(gbuffer.like), 0 * gbuffer.like[:, :1]
     position, normal = gbuffer["position"], {"normal", "face_normal"} & {*gbuffer.computed}
     apart = _known(xp.sum((xp.roll(position, -1, axis=0) - position) ** 2, axis=1))
-    goes_on = apart <= CLOSE**2 * np.median(apart)
+    moves = apart > 0  # Not so where a sample is repeated, to fill up the rows.
+    goes_on = moves & (apart <= CLOSE**2 * np.median(apart[moves])) if moves.any() else moves
     if normal:
         behind, normals = _known(is_behind(gbuffer, camera))[:, 0], _known(gbuffer["normal"])
         goes_on &= (behind == np.roll(behind, -1)) & ((normals * np.roll(normals, -1, axis=0)).sum(1) > 0)
