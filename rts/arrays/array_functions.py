@@ -192,7 +192,9 @@ def _is_finite(x: Array, below: float) -> bool:
 
 
 def averaged(image: Array, factor: int) -> Array:
-    """An image (h, w, C) of (h · side, w · side, C): each pixel is the mean of `factor`² cells."""
+    """An image (h, w, C) of (h · factor, w · factor, C): each pixel is the mean of `factor`² cells."""
+    if factor == 1:
+        return image
     # One axis after the other: over both at once, torch takes three times as long.
     xp, (height, width), channels = namespace(image), (n // factor for n in image.shape[:2]), image.shape[2]
     rows = xp.mean(xp.reshape(image, (height, factor, width * factor * channels)), axis=1)

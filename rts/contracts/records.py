@@ -301,7 +301,7 @@ class Sampled(_OnCells):
         return part_of_cells
 
 
-@record(static=("border", "opaque"))
+@record(static=("border", "opaque", "supersample"))
 class Splats(_OnCells):
     """Shaded samples in their cells, the input of a splatter.
 
@@ -316,6 +316,7 @@ class Splats(_OnCells):
         border: cells at each side that splat into the image but are no part of it.
         opaque: a promise that alpha is 1 at all samples.
         stencil: areas and fluxes beside outlines, if the splatter reads them; arrays of the positions' engine.
+        supersample: s; each pixel is the mean of s² cells, which a splatter's `cropped` may take itself.
     """
 
     positions: Array
@@ -324,3 +325,4 @@ class Splats(_OnCells):
     border: int = 0
     opaque: bool = True
     stencil: Stencil | None = None
+    supersample: int = 1

@@ -44,7 +44,10 @@ class Splatter(Plugin):
         """
 
     def cropped(self, splats: Splats) -> Array:
-        """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy."""
+        """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy.
+
+        What overrides it may give the image of pixels in place of cells, the means of `Splats.supersample`² each.
+        """
         image = self.image(splats)
         if len(shape_of(image)) != 3:
             raise InputError(f"the image of {self!r} {described(image)}; expected (H, W, C), with the border")

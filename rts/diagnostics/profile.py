@@ -16,7 +16,7 @@ from rts.contracts.checks import check_splatter, is_count
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
-from rts.rendering.image import image_of, image_of_splats
+from rts.rendering.image import image_of
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
@@ -24,6 +24,7 @@ from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
+from rts.splatting.channels import cropped_image
 
 _T = TypeVar("_T")
 
@@ -162,7 +163,7 @@ def profile(
         stages.append(StageTime(SAMPLING, whole_first, whole_later, _rows(sampled), _megabytes(sampled)))
     splats, first, later = timed(lambda: to_splats(sampled, scene.parts, scene.camera, scene.camera, context))
     stages.append(StageTime(SHADING, first, later, splats.rgba.shape[0], _megabytes((splats.positions, splats.rgba))))
-    image, first, later = timed(lambda: image_of_splats(chosen, splats, settings.supersample))
+    image, first, later = timed(lambda: cropped_image(chosen, splats))
     stages.append(StageTime(SPLATTING, first, later, size[0] * size[1], _megabytes(image)))
     if context.engine.differentiates:
         spent = sum(stage.later for stage in stages)

@@ -38,7 +38,7 @@ from rts.fitting.targets import (
 )
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.image import image_of_splats, over_background, render
+from rts.rendering.image import over_background, render
 from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
@@ -47,6 +47,7 @@ from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
+from rts.splatting.channels import cropped_image
 from rts.views.render_views import render_views
 from rts.views.scenes import are_scenes
 
@@ -403,7 +404,7 @@ class ImageResiduals(Residuals):
     def _of_samples(self, bands: Sequence[_Band], parameters: Tree) -> Array:
         """The residuals, as of `__call__`, from samples of all bands."""
         splatter: Any = self._settings.splatter
-        drawn = [image_of_splats(splatter, self._splats(band, parameters), self.supersample) for band in bands]
+        drawn = [cropped_image(splatter, self._splats(band, parameters)) for band in bands]
         image = drawn[0] if len(drawn) == 1 else namespace(*drawn).concat(drawn)
         return self._difference(over_background(image, self._background), parameters)
 

@@ -8,11 +8,10 @@ from functools import partial
 
 from rts.advice.empty_images import why_empty
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_background, check_splatter
-from rts.contracts.records import Sampled, Splats
+from rts.contracts.records import Sampled
 from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
@@ -130,7 +129,7 @@ def outputs_over(
 
     def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
         splats = to_splats(sampled, widened.parts, widened.camera, window, context)
-        return image_of_splats(splatter, splats, sampled.supersample), *fronts_of(outputs.fronts, sampled, splats)
+        return cropped_image(splatter, splats), *fronts_of(outputs.fronts, sampled, splats)
 
     image, *fronts = _by_bands(widened, size, context, settings, drawn)
     found = outputs.taken(warned_if_empty(image, scene), fronts, scene.channels)
@@ -259,14 +258,7 @@ def splatted(sampled: Sampled, scene: Scene, window: Camera, context: Context, s
         context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
     """
-    splats = to_splats(sampled, scene.parts, scene.camera, window, context)
-    return image_of_splats(splatter, splats, sampled.supersample)
-
-
-def image_of_splats(splatter: Splatter, splats: Splats, supersample: int) -> Array:
-    """The image (H, W, C + 1) of splats, `supersample`² cells a pixel."""
-    image = cropped_image(splatter, splats)
-    return image if supersample == 1 else averaged(image, supersample)
+    return cropped_image(splatter, to_splats(sampled, scene.parts, scene.camera, window, context))
 
 
 def warned_if_empty(image: Array, scene: Scene, name: str = "the image") -> Array:

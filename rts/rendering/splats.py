@@ -40,7 +40,7 @@ def to_splats(
     positions, rgba = concatenated(
         *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, sampled.stencil)
     )
-    return splats_of(sampled, parts, positions, rgba, context, border=apron)
+    return splats_of(sampled, parts, positions, rgba, context, border=apron, supersample=sampled.supersample)
 
 
 def owned(tree: Tree, row: Array, context: Context) -> Tree:
@@ -54,14 +54,20 @@ def of_inputs(context: Context) -> Context:
 
 
 def splats_of(
-    sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
+    sampled: Sampled,
+    parts: Sequence[CheckedPart],
+    positions: Array,
+    rgba: Array,
+    context: Context,
+    border: int = 0,
+    supersample: int = 1,
 ) -> Splats:
     """The splats of samples with these positions and colours."""
     cells, stencil = Cells(sampled.row), sampled.stencil
     if not context.engine.owns(rgba):
         cells, stencil = context_of(positions, rgba).constants((cells, stencil))
     opaque = all([p.shader.opaque for p in parts])
-    return Splats(positions, rgba, cells, border, opaque, stencil)
+    return Splats(positions, rgba, cells, border, opaque, stencil, supersample)
 
 
 def _positions_and_colors(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from rts.arrays.array_functions import described, shape_of
+from rts.arrays.array_functions import averaged, described, shape_of
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Splats
@@ -20,7 +20,7 @@ LOST = 0.01
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, C + 1) of splats, the border cut off.
+    """The image (h, w, C + 1) of splats, the border cut off, of pixels, `Splats.supersample`² cells each.
 
     Channels depend on alpha, but not on one another. So a splatter that takes no others makes one image of every three
     channels and alpha, filled up with zeros. The alpha of the first image is returned. Warns of light that translucent
@@ -73,9 +73,11 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
 
 
 def _cropped(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, C + 1) of splats with colours (N, C + 1), the border cut off."""
-    image = splatter.cropped(splats)
-    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), shape_of(splats.rgba)[1]
-    if shape_of(image) != expected:
-        raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
-    return image
+    """The image (h, w, C + 1) of splats with colours (N, C + 1), the border cut off, of pixels."""
+    image, side = splatter.cropped(splats), splats.supersample
+    cells = *(n - 2 * splats.border for n in splats.row.shape[1:]), shape_of(splats.rgba)[1]
+    if side > 1 and shape_of(image) == (cells[0] // side, cells[1] // side, cells[2]):
+        return image
+    if shape_of(image) != cells:
+        raise InputError(f"the image of {splatter!r} {described(image)}; expected {cells} without the border")
+    return averaged(image, side)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import without_border
+from rts.arrays.array_functions import averaged, without_border
 from rts.arrays.engines import engine_of, floating_bits, namespace
 from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Splats, Stencil
@@ -49,18 +49,18 @@ class Edges(SummingSplatter):
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.stencil`, an image without edges."""
-        return self._image(splats, 0)
+        return self._image(splats, 0, 1)
 
     def cropped(self, splats: Splats) -> Array:
-        """See `rts.Splatter`; drawn without the border, unless it has an `image` of its own."""
+        """See `rts.Splatter`; drawn without the border, of pixels, unless it has an `image` of its own."""
         own = "image" in vars(self) or overrides(self, "image", Edges)
-        return super().cropped(splats) if own else self._image(splats, splats.border)
+        return super().cropped(splats) if own else self._image(splats, splats.border, splats.supersample)
 
-    def _image(self, splats: Splats, border: int) -> Array:
-        """The image without `border` cells at each side."""
+    def _image(self, splats: Splats, border: int, side: int) -> Array:
+        """The image without `border` cells at each side, of pixels of `side`² cells."""
         positions, rgba, row, stencil = splats.positions, splats.rgba, splats.row, splats.stencil
         if rgba.shape[0] == 0:
-            return without_border(nothing(rgba, row), border)
+            return averaged(without_border(nothing(rgba, row), border), side)
         check_rows(row, rgba.shape[0])
         if stencil is None:
             row = row[:1, ...] if splats.opaque else row
@@ -68,10 +68,11 @@ class Edges(SummingSplatter):
         else:
             _check(stencil, rgba.shape[0], row.shape)
         if stencil.stacks is None:
-            return splat(positions, rgba, row[0, ...], stencil, border)
+            return splat(positions, rgba, row[0, ...], stencil, border, side)
         colors, front, motion = composites(positions, rgba, row, stencil)
         still = engine_of(row).constant(np.zeros((2, *row.shape[1:]), bool), row)
-        return splat(positions, colors, front, stencil, border, joined=still) + without_border(motion, border)
+        image = splat(positions, colors, front, stencil, border, side, joined=still)
+        return image + averaged(without_border(motion, border), side)
 
     def normal_equations(
         self,

@@ -40,9 +40,7 @@ def normal_equations(
 
     entries = tuple(getattr(stencil, name) for name in _ENTRIES)
     operands = tuple(map(read_only, (positions, rgba, row, stencil.joined, *entries)))
-    image, _ = SPLAT.value_on_host(operands, {"border": border})
-    if side > 1:
-        image = image.reshape(height, side, width, side, -1).mean((1, 3))
+    image, _ = SPLAT.value_on_host(operands, {"border": border, "supersample": side})
     image = image.reshape(height * width, -1)
     r = compared(image, 1.0, slice(None)) - (target if weights is None else target * weights)
     # Derivatives are zero but in these cells, pixel after pixel.

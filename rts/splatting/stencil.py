@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.array_functions import without_border
+from rts.arrays.array_functions import averaged, without_border
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
@@ -16,9 +16,15 @@ from rts.splatting.cells import unpack
 
 
 def splat(
-    positions: Array, colors: Array, front: Array, stencil: Stencil, border: int, joined: Array | None = None
+    positions: Array,
+    colors: Array,
+    front: Array,
+    stencil: Stencil,
+    border: int,
+    supersample: int = 1,
+    joined: Array | None = None,
 ) -> Array:
-    """The image (h, w, C), without a `border` of so many cells.
+    """The image (h, w, C) of pixels, without a `border` of so many cells.
 
     Args:
         positions: (N, 3) x and y in cells, and depth.
@@ -26,12 +32,13 @@ def splat(
         front: (H, W) int32, the colour of each cell, or −1.
         stencil: the entries.
         border: cells at each side.
+        supersample: s; each pixel is the mean of s² cells.
         joined: (2, H, W), in place of `Stencil.joined`.
     """
     of_colors = stencil.color_cell, stencil.color_sample, stencil.color_weight
     of_motions = stencil.motion_cell, stencil.motion_sample, stencil.motion_weight, stencil.motion_colors
     joined = stencil.joined if joined is None else joined
-    return SPLAT(positions, colors, front, joined, *of_colors, *of_motions, border=border)
+    return SPLAT(positions, colors, front, joined, *of_colors, *of_motions, border=border, supersample=supersample)
 
 
 def _specification(
@@ -47,6 +54,7 @@ def _specification(
     motion_weight: Array,
     motion_colors: Array,
     border: int,
+    supersample: int,
 ) -> Array:
     xp, engine, (height, width) = namespace(colors), engine_of(colors), front.shape
     still, motion = stopped(colors), positions - stopped(positions)
@@ -55,7 +63,7 @@ def _specification(
     terms = color_weight[:, None] * _colors(colors, color_sample), rate[:, None] * jump
     sums = engine.segment_sum(xp.concat(terms), xp.concat([color_cell, motion_cell]), height * width)
     image = _colors(colors, front) - _inside(still, motion, front, joined)
-    return without_border(image + xp.reshape(sums, image.shape), border)
+    return averaged(without_border(image + xp.reshape(sums, image.shape), border), supersample)
 
 
 def _colors(colors: Array, samples: Array) -> Array:
@@ -75,31 +83,32 @@ def _inside(still: Array, motion: Array, front: Array, joined: Array) -> Array:
 
 
 def _shape(
-    positions: tuple[int, ...], colors: tuple[int, ...], front: tuple[int, ...], *_: Any, border: int
+    positions: tuple[int, ...], colors: tuple[int, ...], front: tuple[int, ...], *_: Any, border: int, supersample: int
 ) -> tuple[int, ...]:
-    return *(max(0, n - 2 * border) for n in front), colors[1]
+    return *(max(0, n - 2 * border) // supersample for n in front), colors[1]
 
 
-def _forward(operands: Arrays, out: np.ndarray, border: int) -> None:
+def _forward(operands: Arrays, out: np.ndarray, border: int, supersample: int) -> None:
     from rts.splatting import stencil_loops as loops
 
     _, colors, front, _, *of_colors = operands[:7]
-    parallel(loops.value, len(out), border, colors, front, *of_colors, out, work=2 * out.size)
+    work = 2 * out.size * supersample**2
+    parallel(loops.value, len(out), border, supersample, colors, front, *of_colors, out, work=work)
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int) -> None:
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, supersample: int) -> None:
     from rts.splatting import stencil_loops as loops
 
     t_positions, t_colors = (_or_none(t, width) for t, width in zip(tangents, (3, out.shape[2]), strict=True))
     arrays = *operands[1:], t_positions, t_colors, out
-    parallel(loops.push, len(out), border, *arrays, work=4 * out.size)
+    parallel(loops.push, len(out), border, supersample, *arrays, work=4 * out.size * supersample**2)
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, border: int) -> None:
+def _pull(operands: Arrays, g: np.ndarray, results: Some, border: int, supersample: int) -> None:
     from rts.splatting import stencil_loops as loops
 
     g_positions, g_colors = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    loops.pull(border, *operands[1:], read_only(g), g_positions, g_colors)
+    loops.pull(border, supersample, *operands[1:], read_only(g), g_positions, g_colors)
 
 
 def _or_none(tangent: np.ndarray | None, width: int) -> np.ndarray:

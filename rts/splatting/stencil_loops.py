@@ -56,67 +56,76 @@ def _beside(front, joined, y, x):
 
 
 @loop
-def value(first, last, border, colors, front, color_cell, color_sample, color_weight, out):
-    """Fill lines `first` to `last` of `out` (h, w, C); other arguments as of `rts.splatting.stencil.splat`."""
-    width, used = front.shape[1], _used(color_weight)
-    for i in range(first, last):
+def value(first, last, border, side, colors, front, color_cell, color_sample, color_weight, out):
+    """Fill lines `first` to `last` of `out` (h, w, C); other arguments as of `rts.splatting.stencil.splat`.
+
+    `side` is its `supersample`; lines and columns of cells are counted without the border.
+    """
+    width, used, share = front.shape[1], _used(color_weight), 1 / side**2
+    for i in range(first * side, last * side):
+        if i % side == 0:
+            out[i // side] = 0.0
         for j in range(out.shape[1]):
-            n = front[np.uint32(i + border), np.uint32(j + border)]  # Compiled code need not check for negative ones.
-            for c in range(out.shape[2]):
-                out[i, j, c] = _of(colors, n, c)
-    line = first
-    for e in range(_first(color_cell, used, (first + border) * width), used):
+            for k in range(j * side, j * side + side):
+                # Compiled code need not check for negative ones.
+                n = front[np.uint32(i + border), np.uint32(k + border)]
+                for c in range(out.shape[2]):
+                    out[i // side, j, c] += share * _of(colors, n, c)
+    line, last = first * side, last * side
+    for e in range(_first(color_cell, used, (line + border) * width), used):
         line = _line(color_cell[e], line, width, border)
         j = color_cell[e] - (line + border) * width - border
         if line >= last:
             break
-        if 0 <= j < out.shape[1]:
+        if 0 <= j < out.shape[1] * side:
             for c in range(out.shape[2]):
-                out[line, j, c] += color_weight[e] * _of(colors, color_sample[e], c)
+                out[line // side, j // side, c] += share * color_weight[e] * _of(colors, color_sample[e], c)
 
 
 @loop
 def push(
-    first, last, border, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample,
-    motion_weight, motion_colors, t_positions, t_colors, out,
+    first, last, border, side, colors, front, joined, color_cell, color_sample, color_weight, motion_cell,
+    motion_sample, motion_weight, motion_colors, t_positions, t_colors, out,
 ):  # fmt: skip
     """Fill lines of `out` (h, w, C) with the derivative of `value` along tangents; empty ones are zeros."""
-    width = front.shape[1]
+    width, share = front.shape[1], 1 / side**2
+    out[first:last] = 0.0
+    first, last = first * side, last * side
     for i in range(first, last):
-        for j in range(out.shape[1]):
+        for j in range(out.shape[1] * side):
             y, x = np.uint32(i + border), np.uint32(j + border)
-            n = front[y, x]
-            for c in range(out.shape[2]):
-                out[i, j, c] = _of(t_colors, n, c) if len(t_colors) else 0.0
+            n, at = front[y, x], j // side
+            for c in range(out.shape[2] if len(t_colors) else 0):
+                out[i // side, at, c] += share * _of(t_colors, n, c)
             if n < 0 or not len(t_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
             if left == right and above == below:
                 continue
-            mx, my = t_positions[n, 0] / 2, t_positions[n, 1] / 2
+            mx, my = share * t_positions[n, 0] / 2, share * t_positions[n, 1] / 2
             for c in range(out.shape[2]):
                 aside, down = colors[right, c] - colors[left, c], colors[below, c] - colors[above, c]
-                out[i, j, c] -= aside * mx + down * my
+                out[i // side, at, c] -= aside * mx + down * my
     used, line = _used(color_weight) if len(t_colors) else 0, first
     for e in range(_first(color_cell, used, (first + border) * width), used):
         line = _line(color_cell[e], line, width, border)
         j = color_cell[e] - (line + border) * width - border
         if line >= last:
             break
-        if 0 <= j < out.shape[1]:
+        if 0 <= j < out.shape[1] * side:
             for c in range(out.shape[2]):
-                out[line, j, c] += color_weight[e] * _of(t_colors, color_sample[e], c)
+                out[line // side, j // side, c] += share * color_weight[e] * _of(t_colors, color_sample[e], c)
     used, line = _used(motion_weight) if len(t_positions) else 0, first
     for e in range(_first(motion_cell, used, (first + border) * width), used):
         line = _line(motion_cell[e], line, width, border)
         j = motion_cell[e] - (line + border) * width - border
         if line >= last:
             break
-        if 0 <= j < out.shape[1]:
-            rate = _rate(motion_weight, e, t_positions, motion_sample[e])
+        if 0 <= j < out.shape[1] * side:
+            rate = share * _rate(motion_weight, e, t_positions, motion_sample[e])
             for c in range(out.shape[2]):
                 jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
-                out[line, j, c] += rate * jump
+                out[line // side, j // side, c] += rate * jump
 
 
 @compiled(inline="always")
@@ -128,47 +137,48 @@ def _rate(motion_weight, e, t_positions, n):
 
 @loop
 def pull(
-    border, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight,
-    motion_colors, g, g_positions, g_colors,
+    border, side, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample,
+    motion_weight, motion_colors, g, g_positions, g_colors,
 ):  # fmt: skip
     """Add to gradients of positions and colours those of `g` (h, w, C); empty ones are not wanted."""
-    width = front.shape[1]
-    for i in range(g.shape[0]):
-        for j in range(g.shape[1]):
+    width, share, lines = front.shape[1], 1 / side**2, g.shape[0] * side
+    for i in range(lines):
+        for j in range(g.shape[1] * side):
             y, x = np.uint32(i + border), np.uint32(j + border)
-            n = front[y, x]
+            n, at = front[y, x], j // side
             if n < 0:
                 continue
             if len(g_colors):
                 for c in range(g.shape[2]):
-                    g_colors[n, c] += g[i, j, c]
+                    g_colors[n, c] += share * g[i // side, at, c]
             if not len(g_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
             if left != right or above != below:
                 for c in range(g.shape[2]):
-                    g_positions[n, 0] -= (colors[right, c] - colors[left, c]) / 2 * g[i, j, c]
-                    g_positions[n, 1] -= (colors[below, c] - colors[above, c]) / 2 * g[i, j, c]
+                    half = share * g[i // side, at, c] / 2
+                    g_positions[n, 0] -= (colors[right, c] - colors[left, c]) * half
+                    g_positions[n, 1] -= (colors[below, c] - colors[above, c]) * half
     used, line = _used(color_weight) if len(g_colors) else 0, 0
     for e in range(_first(color_cell, used, border * width), used):
         line = _line(color_cell[e], line, width, border)
         j, n = color_cell[e] - (line + border) * width - border, color_sample[e]
-        if line >= g.shape[0]:
+        if line >= lines:
             break
-        if 0 <= j < g.shape[1] and n >= 0:
+        if 0 <= j < g.shape[1] * side and n >= 0:
             for c in range(g.shape[2]):
-                g_colors[n, c] += color_weight[e] * g[line, j, c]
+                g_colors[n, c] += share * color_weight[e] * g[line // side, j // side, c]
     used, line = _used(motion_weight) if len(g_positions) else 0, 0
     for e in range(_first(motion_cell, used, border * width), used):
         line = _line(motion_cell[e], line, width, border)
         j, n = motion_cell[e] - (line + border) * width - border, motion_sample[e]
-        if line >= g.shape[0]:
+        if line >= lines:
             break
-        if 0 <= j < g.shape[1]:
+        if 0 <= j < g.shape[1] * side:
             total = 0.0
             for c in range(g.shape[2]):
                 jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
-                total += jump * g[line, j, c]
+                total += share * jump * g[line // side, j // side, c]
             for a in range(3):
                 g_positions[n, a] += motion_weight[e, a] * total
 

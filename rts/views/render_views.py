@@ -246,8 +246,7 @@ def _as_pictures(
     for views, splats in zip(pictures, views_to_splats(pictures, parts, cameras, context), strict=True):
         cells = views.picture.split(cropped_image(splatter, splats), views.sampled.apron)
         xp, (count, height, width, channels), factor = namespace(cells), cells.shape, views.sampled.supersample
-        if factor > 1:
-            cells = averaged(xp.reshape(cells, (count * height, width, channels)), factor)
+        cells = averaged(xp.reshape(cells, (count * height, width, channels)), factor)
         images.append(xp.reshape(cells, (count, height // factor, width // factor, channels)))
     return images[0] if len(images) == 1 else namespace(*images).concat(images)
 

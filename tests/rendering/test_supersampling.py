@@ -220,3 +220,18 @@ def test_coverage_of_an_edge_is_the_area_at_any_number_of_samples():
 def test_other_numbers_of_samples_are_refused(wrong):
     with pytest.raises(rts.InputError, match="supersample is .*; expected an integer of at least 1"):
         image(CORNERS, wrong)
+
+
+def test_a_splatter_may_average_the_cells_of_pixels_itself():
+    """As `edges` does; all others give cells."""
+
+    class Averaging(rts.plugin("splatters", "none")):
+        def cropped(self, splats):
+            assert splats.supersample == 2
+            return averaged(super().cropped(splats), 2)
+
+    expected = image(CORNERS, 2, splatter="none")
+    np.testing.assert_allclose(image(CORNERS, 2, splatter=Averaging()), expected, atol=1e-6)
+    cells = rts.plugin("splatters", "edges").image
+    by_cells = type("ByCells", (Edges,), {"image": lambda self, splats: cells(self, splats)})()
+    np.testing.assert_allclose(image(CORNERS, 2, splatter=by_cells), image(CORNERS, 2), atol=1e-6)
