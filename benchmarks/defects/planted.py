@@ -244,8 +244,8 @@ LOOPS = [
     Defect(
         "gradients of colours forget the areas beside outlines",
         "rts/splatting/stencil_loops.py",
-        "g_colors[n, c] += color_weight[e] * g[line, j, c]",
-        "g_colors[n, c] += g[line, j, c]",
+        "g_colors[n, c] += share * color_weight[e] * g[line // side, j // side, c]",
+        "g_colors[n, c] += share * g[line // side, j // side, c]",
         "edges_operations",
     ),
     Defect(

@@ -445,7 +445,7 @@ class ImageResiduals(Residuals):
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
         context, apron = context_of(vector), band.sampled.apron
         sampled = owned(band.sampled, band.sampled.row, context)
-        known = constants(splats_of(sampled, band.parts, positions, rgba, context, apron), engine, vector)
+        known = constants(splats_of(sampled, band.parts, positions, rgba, context, border=apron), engine, vector)
         loss = self.loss if self.loss.robust else None
         tangents = t_positions, t_rgba if colored else None
         return splatter.normal_equations(known, *tangents, target, weights, background, loss)

@@ -54,20 +54,14 @@ def of_inputs(context: Context) -> Context:
 
 
 def splats_of(
-    sampled: Sampled,
-    parts: Sequence[CheckedPart],
-    positions: Array,
-    rgba: Array,
-    context: Context,
-    border: int = 0,
-    supersample: int = 1,
+    sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, **more: int
 ) -> Splats:
-    """The splats of samples with these positions and colours."""
+    """The splats of samples with these positions and colours; `more` are their `border` and `supersample`."""
     cells, stencil = Cells(sampled.row), sampled.stencil
     if not context.engine.owns(rgba):
         cells, stencil = context_of(positions, rgba).constants((cells, stencil))
     opaque = all([p.shader.opaque for p in parts])
-    return Splats(positions, rgba, cells, border, opaque, stencil, supersample)
+    return Splats(positions, rgba, cells, opaque=opaque, stencil=stencil, **more)
 
 
 def _positions_and_colors(
