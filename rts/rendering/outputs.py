@@ -9,14 +9,13 @@ from typing import Any
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import namespace, stopped
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.shader import Shader
 from rts.errors import InputError
-from rts.operations.means import Channels, channels_of
 from rts.plugin_base import promised
 from rts.rendering.settings import RenderSettings
 from rts.sampling.scene import Scene
@@ -25,6 +24,8 @@ MEANS = {"depth": 1, "normal": 3, "position": 3, "uv": 2}
 """Name → number of channels, of outputs that are means over what is covered of a pixel."""
 FRONTS = ("depth_front", "part", "triangle")
 """Outputs of the sample in front at the centre of a pixel."""
+LEAST_ALPHA = 1e-3
+"""Pixels of a smaller alpha count as empty: what little is covered of them tells no mean."""
 
 
 class Outputs:
@@ -105,18 +106,26 @@ class Outputs:
                 raise InputError(
                     f"the attribute {name!r} has {sorted(widths)} numbers a sample, by part; expected as many in all"
                 )
-        found, first = {}, 0
-        for name in self.means:
-            (width,) = self._widths[name]
-            # The mean of normals of length 1; other means are shares of what is covered.
-            found[name] = Channels(first, width, "direction" if name == "normal" else "mean")
-            first += width
-        found["color"] = Channels(first, channels + 1, "value")
-        found["alpha"] = Channels(first + channels, 1, "value")
-        wanted = [name for name in self.names if name not in FRONTS]
-        arrays = channels_of(image, [found[name] for name in wanted]) if wanted else []
-        outputs = {**dict(zip(wanted, arrays, strict=True)), **dict(zip(self.fronts, fronts, strict=True))}
+        xp, sizes = namespace(image), [*(min(self._widths[name]) for name in self.means), channels, 1]
+        # Cut once, since the derivative of a slice is an array as large as the image.
+        pieces = [xp.moveaxis(x, 0, -1) for x in engine_of(image).split(xp.moveaxis(image, -1, 0), sizes)]
+        color, alpha = pieces[-2:]
+        outputs = {**dict(zip(self.fronts, fronts, strict=True)), "alpha": alpha}
+        if "color" in self.names:
+            outputs["color"] = xp.concat([color, alpha], axis=-1)
+        covered = alpha >= LEAST_ALPHA
+        for name, shares in zip(self.means, pieces, strict=False):
+            # Normals are scaled to length 1; other means are shares of what is covered.
+            size = alpha if name != "normal" else _length(shares)
+            outputs[name] = shares * xp.where(covered, 1 / xp.where(covered, size, 1.0), 0.0)
         return {name: outputs[name] for name in self.names}
+
+
+def _length(x: Array) -> Array:
+    """The lengths (..., 1) of vectors (..., C); 1 for those that are zero."""
+    xp = namespace(x)
+    square = xp.sum(x * x, axis=-1, keepdims=True)
+    return xp.sqrt(xp.where(square > 0, square, 1.0))
 
 
 class _Widened(Shader):

@@ -10,7 +10,6 @@ import rts
 from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
-from rts.operations.means import MEANS, Channels, channels_of
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import TAKE, take
 from rts.operations.texels import TEXELS, texels
@@ -329,25 +328,6 @@ def test_whole_numbers_are_coordinates(target):
     np.testing.assert_allclose(to_numpy(found), to_numpy(expected), atol=1e-6)
 
 
-EACH_KIND = (Channels(3, 3, "value"), Channels(1, 2, "mean"), Channels(2, 3, "direction"), Channels(5, 1, "value"))
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_channels_are_means_over_what_is_covered_and_0_where_little_is(target):
-    image = RNG.normal(size=(4, 5, 6))
-    image[..., 5] = np.linspace(-0.1, 1, 20).reshape(4, 5)
-    image[2, 3, 2:5] = 0
-    value, mean, direction, alpha = (to_numpy(x) for x in channels_of(arrays(target, image), EACH_KIND))
-    covered = image[..., 5:] >= 1e-3
-    np.testing.assert_allclose(value, image[..., 3:], rtol=1e-6)
-    np.testing.assert_allclose(alpha, image[..., 5:], rtol=1e-6)
-    np.testing.assert_allclose(
-        mean, np.where(covered, image[..., 1:3] / np.where(covered, image[..., 5:], 1), 0), rtol=1e-5
-    )
-    length = np.maximum(np.linalg.norm(image[..., 2:5], axis=-1, keepdims=True), 1e-9)
-    np.testing.assert_allclose(direction, np.where(covered, image[..., 2:5] / length, 0), rtol=1e-5)
-
-
 def test_images_that_are_not_there_are_refused():
     table, uv = np.zeros((12, 3), np.float32), np.zeros((2, 2), np.float32)
     with pytest.raises(rts.InputError, match="images from 0 to 1 were asked for, of 1"):
@@ -371,7 +351,6 @@ def cases():
     view = np.array([1] * 8 + [3] * 12, np.int32)
     table, uv = rng.random((3 * 4 + 5 * 2, 3)), 1.5 * rng.normal(size=(20, 2))
     image, sizes = rng.integers(0, 2, 20).astype(np.int32), {"sizes": ((3, 4), (5, 2))}
-    pixels = np.abs(rng.normal(size=(700, 6))) * (rng.random((700, 1)) > 0.2)
     return {
         "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
         "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
@@ -382,7 +361,6 @@ def cases():
         "projection": (projection.PROJECTION, [ahead[0], points], {}),
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
         "unit": (UNIT, [points], {}),
-        "means": (MEANS, [pixels], {"groups": EACH_KIND, "least": 1e-3}),
         "texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("repeat", "mirror"), "filter": "linear"}),
         "texels of one": (TEXELS, [table, uv, image[:0]], {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"}),
         "nearest texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"}),

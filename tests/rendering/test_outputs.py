@@ -132,6 +132,19 @@ def test_light_that_passes_weighs_what_lies_behind():
     np.testing.assert_allclose(found["depth"], 0.25 * NEAR + 0.75 * FAR, atol=1e-5)
 
 
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize(("alpha", "kept"), [(5e-4, 0), (2e-3, 1)])
+def test_pixels_of_which_hardly_anything_is_covered_tell_no_means(target, alpha, kept):
+    glass = card(NEAR, -9, 9, color=np.array([1, 1, 1, alpha])).replace(
+        shader=rts.plugin("rts.shaders", "unlit")(opaque=False)
+    )
+    names, glass = ("depth", "normal", "alpha"), glass.replace(theta=arrays(target, glass.theta))
+    found = rts.render(glass, CAMERA, (8, 8), outputs=names)
+    np.testing.assert_allclose(to_numpy(found["alpha"]), alpha, rtol=1e-4)
+    np.testing.assert_allclose(to_numpy(found["depth"]), kept * NEAR, rtol=1e-4)
+    np.testing.assert_allclose(to_numpy(found["normal"]), np.broadcast_to([0, 0, kept], (8, 8, 3)), atol=1e-5)
+
+
 def test_attributes_of_the_surface_are_outputs():
     colors = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
     part = card(NEAR, -9, 9, colors=colors).replace(shader="silhouette")
