@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Sequence
 from typing import Any
 
-from rts.advice.empty_images import is_new
+from rts.advice.what_to_look_at import is_new
 from rts.arrays.engines import namespace, value_of
 from rts.contracts.checked_parts import CheckedPart
 from rts.errors import InputWarning, warn

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import stopped, value_of
-from rts.arrays.trees import Tree, map_leaves
+from rts.advice.what_to_look_at import known_tree
+from rts.arrays.engines import stopped
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Proxy
 from rts.contracts.surface import TriangleSurface
@@ -80,26 +78,3 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
         if (sign * at[:, axis] > at[:, 3]).all():
             return f"lies outside of the view, beyond its {side} edge"
     return None
-
-
-def known_tree(tree: Tree) -> Tree | None:
-    """The tree as NumPy arrays; None if an array is traced or batched."""
-    is_known = []
-
-    def value(x: object) -> object:
-        array = value_of(x)
-        is_known.append(array is not None and array.shape == tuple(getattr(x, "shape", ())))
-        return array
-
-    host = map_leaves(value, tree)
-    return host if all(is_known) else None
-
-
-def is_new(surface: Any, seen: weakref.WeakSet[Any]) -> bool:
-    """True for a surface that is not among those `seen`, where it is from now on."""
-    try:
-        new = surface not in seen
-        seen.add(surface)
-    except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
-        return False
-    return new

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.advice.empty_images import is_new, known_tree
+from rts.advice.what_to_look_at import is_new, known_tree
 from rts.arrays.engines import stopped
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
