@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from rts.arrays.array_functions import averaged, described, shape_of
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
@@ -62,7 +64,8 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
                 LayersWarning,
             )
         return
-    light = (1 - alpha[row[:, row[-1] >= 0]]).prod(axis=0).max(initial=0)
+    full = row.reshape(len(row), -1).take(np.flatnonzero(row[-1] >= 0), axis=1)
+    light = (1 - alpha.take(full)).prod(axis=0).max(initial=0)
     if light > LOST:
         # In tens, so that a loop does not repeat the warning in other words.
         warn(
