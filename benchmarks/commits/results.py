@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import sys
 import time
@@ -122,11 +123,11 @@ class Recorder:
         def record() -> None:
             host = config.engine.host
             sampled = config.engine.sampled(sample, self.variables(config, theta=True))
-            for name in ("row", "depth", "overflow"):
-                self.arrays[config.key("samples", name)] = host(getattr(sampled, name))
+            tables = {"": sampled, **{f"{n}.": samples for n, samples in enumerate(sampled.samples)}}
+            for (of, table), name in itertools.product(tables.items(), ("row", "depth", "overflow")):
+                if getattr(table, name) is not None:  # The cells of a single part may have no depth.
+                    self.arrays[config.key("samples", of + name)] = host(getattr(table, name))
             for n, samples in enumerate(sampled.samples):
-                for name in ("row", "depth", "overflow"):
-                    self.arrays[config.key("samples", f"{n}.{name}")] = host(getattr(samples, name))
                 row = host(samples.row)
                 used = np.unique(row[row >= 0])  # Other rows may hold anything.
                 for name in ("ids", "params"):
