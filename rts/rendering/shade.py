@@ -65,8 +65,9 @@ def shaded_at_once(part: CheckedPart) -> bool:
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
-    """The θ that a part's shader sees; NumPy entries that the surface does not read become the engine's constants."""
-    return {k: v if k in part.read else context.constants(v) for k, v in part.theta.items()}
+    """The θ that a part's shader sees: NumPy entries are the engine's constants, but those of the surface alone."""
+    left = set() if part.reads is None else set(part.read) - set(part.reads)
+    return {k: v if k in left else context.constants(v) for k, v in part.theta.items()}
 
 
 def add_footprint(

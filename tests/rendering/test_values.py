@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+from example_surfaces import Torus
 from helpers import ALL, DIFFERENTIABLE, arrays, gradient, to_numpy
 
 import rts
@@ -500,3 +501,29 @@ def test_render_samples_of_something_else_is_refused():
 def test_a_capacity_beyond_memory_is_refused():
     with pytest.raises(InputError, match=r"capacity is 100000000000000, rows of about .* GiB"):
         show(capacity=10**14)
+
+
+class Greedy(Torus):
+    """A surface that may read any entry of θ."""
+
+    def reads(self, theta):
+        return tuple(theta)
+
+
+def test_shaders_get_constants_of_the_engine_that_the_surface_may_read_too():
+    torch = pytest.importorskip("torch")
+    color, seen = np.float32([0.8, 0.5, 0.3]), []
+
+    def shader(theta, gbuffer, camera):
+        seen.append(type(theta["color"]))
+        return rts.namespace(gbuffer["normal"]).concat([gbuffer["normal"], 0 * gbuffer["normal"][:, :1] + 1], axis=1)
+
+    def image(pose, shader):
+        part = Part(Greedy(), {"radii": np.float32([0.9, 0.35]), "color": color}, shader, transform=rts.rigid(pose))
+        return rts.render(part, CAMERA, SIZE)
+
+    pose = torch.tensor([0.1, 0.2, 0, 0, 0.1, 0])
+    image(pose, shader)
+    assert set(seen) == {torch.Tensor}
+    slope = torch.func.jvp(lambda pose: image(pose, "lambert"), (pose,), (torch.ones(6),))[1]
+    assert torch.isfinite(slope).all() and slope.abs().max() > 0.1
