@@ -33,8 +33,11 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    operands = [x.contiguous() for x in operands]
-    return (_Value if differentiated() else _Eager).apply(_Call(operation, params), *operands)
+    operands, call = tuple(map(Tensor.contiguous, operands)), _Call(operation, params)
+    if differentiated():
+        return _Value.apply(call, *operands)
+    varied, fixed = call.split(operands)
+    return _Eager.apply((call, fixed), *varied)
 
 
 class _Specifying(threading.local):
@@ -179,8 +182,8 @@ class _Derivatives(torch.autograd.Function):
             found = _Pull.apply(call, wanted, *operands, gradients[0])
         else:
             found = _Pull.forward(call, wanted, *operands, gradients[0])
-        found = (x if wish else None for x, wish in zip(found, wanted, strict=True))
-        return None, *found, *[None] * (len(operands) - call.count)
+        found = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        return None, *found, *[None] * (len(ctx.needs_input_grad) - 1 - call.count)
 
     @staticmethod
     def jvp(ctx, *input_tangents):
@@ -200,10 +203,10 @@ class _Eager(_Derivatives):
     """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python."""
 
     @staticmethod
-    def forward(ctx, call, *operands):
-        ctx.call = call
+    def forward(ctx, call_and_fixed, *varied):
+        call, fixed = call_and_fixed
+        ctx.call, operands = call, (*varied, *fixed)
         ctx.save_for_backward(*operands)
-        ctx.save_for_forward(*operands)
         out, call.kept = call.operation.value_on_host(_host(operands), call.params)
         return torch.from_numpy(out)
 
@@ -234,11 +237,12 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(call, wanted, *arrays):
-        operands, (g,) = _host(arrays[:-1]), _host(arrays[-1:])
-        found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
-        results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        (*operands, g), found, results = _host(arrays), [], []
+        for x, wish in zip(operands, wanted, strict=False):
+            found.append(np.zeros(x.shape if wish else 0, x.dtype))
+            results.append(found[-1] if wish else None)
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
-        return tuple(torch.from_numpy(x) for x in found)
+        return tuple(map(torch.from_numpy, found))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
