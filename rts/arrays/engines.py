@@ -6,6 +6,7 @@ import functools
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -22,12 +23,7 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 def is_constant(tree: Tree) -> bool:
     """True if every leaf is a NumPy array or a Python number, which are never differentiated."""
-    if type(tree) in OWNERS:
-        return False
-    for x in collected(tree):
-        if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES):
-            return False
-    return True
+    return type(tree) not in OWNERS and all(map(isinstance, collected(tree), repeat(CONSTANT_TYPES)))
 
 
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
@@ -242,7 +238,8 @@ def host_value(x: Array) -> np.ndarray:
     """The value of an array, which is not traced."""
     if type(x) is np.ndarray:
         return x
-    value = value_of(x)
+    owner = OWNERS.get(type(x))
+    value = value_of(x) if owner is None else owner.known(x)
     assert value is not None
     return value
 
@@ -286,6 +283,9 @@ def stopped(tree: Tree) -> Tree:
     """A copy of a tree without derivatives, so that results computed from it keep no graph."""
     if type(tree) is np.ndarray:
         return tree
+    owner = OWNERS.get(type(tree))
+    if owner is not None:
+        return owner.stop_gradient(tree)
     return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)
 
 

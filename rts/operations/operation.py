@@ -195,13 +195,12 @@ class Operation:
                 f"the operation {self.name} takes {len(self.ranks)} operands; it was given {len(operands)}"
             )
         kind = type(operands[0])
-        owner = OWNERS.get(kind) if kind is not np.ndarray else engine_of()
+        owner: Any = engine_of() if kind is np.ndarray else OWNERS.get(kind)
         for x, rank in zip(operands, self.ranks, strict=True):
-            if type(x) is not kind or x.ndim != rank:
+            if type(x) is not kind or owner is None or x.ndim != rank:
                 break
         else:
-            if owner is not None:
-                return owner.apply(self, operands, params)
+            return owner.apply(self, operands, params)
         operands = tuple([from_numbers(x, f"an operand of {self.name}") for x in operands])
         if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
             kinds = ", ".join(map(kind_of, operands))
@@ -252,19 +251,16 @@ class Operation:
             )
         return result
 
-    def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
-        """The result, and the object that `forward` keeps for the derivatives, or None."""
-        out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
-        return out, self.forward_on_host(operands, out, params)
-
-    def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
-        """Fill `out` with the value, and return the object that `forward` keeps for the derivatives.
+    def value_on_host(self, operands: Arrays, params: Mapping[str, Any], out: Any = None) -> tuple[np.ndarray, Any]:
+        """The result, in `out` if it is given, and the object that `forward` keeps for the derivatives, or None.
 
         Raises:
             InputError: `forward` cannot take the operands.
         """
+        if out is None:
+            out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         try:
-            return self.forward(operands, out, **params)
+            return out, self.forward(operands, out, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("forward", list(map(_SHAPE, operands)), error) from error
 

@@ -107,8 +107,8 @@ def sampled_scene(
     while True:
         sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)
         if outlines:
-            triangle = sampled.triangle if settings.fronts else None
-            sampled = with_outlines(sampled, scene, grid, told, capacity).replace(triangle=triangle)
+            triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, told, capacity)
+            sampled = sampled.replace(triangle=triangle) if settings.fronts else sampled
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):
             break
         least = 2 * sampled.row.shape[-3]

@@ -114,7 +114,7 @@ def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[tor
     if torch.compiler.is_compiling():
         # torch annotates nothing of what `disable` returns.
         return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
-    if transformed() or foreign(*(a for a in args if isinstance(a, torch.Tensor))):
+    if transformed() or foreign(*[a for a in args if isinstance(a, torch.Tensor)]):
         return _HostCall.apply(fn, specs, *args)
     with torch.no_grad():
         return _HostCall.forward(fn, specs, *args)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, differentiated, foreign, is_zero
-from rts_backends.torch_engine.torch_internals import is_asked_for
+from rts_backends.torch_engine.functions import along, foreign, is_zero
+from rts_backends.torch_engine.torch_internals import differentiated, is_asked_for
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -36,8 +36,7 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     operands, call = tuple(map(Tensor.contiguous, operands)), _Call(operation, params)
     if differentiated():
         return _Value.apply(call, *operands)
-    varied, fixed = call.split(operands)
-    return _Eager.apply((call, fixed), *varied)
+    return _Eager.apply((call, operands[call.count :]), *operands[: call.count])
 
 
 class _Specifying(threading.local):
