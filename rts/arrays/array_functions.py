@@ -167,7 +167,7 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
     Quick if it is true.
     """
     for x in arrays:
-        engine = engine_of(x)
+        engine = OWNERS.get(type(x)) or engine_of(x)
         if not engine.on_host(x):
             below_all = value_of(engine.namespace.all(abs(x) < below))
             if below_all is not None and not below_all.all():

@@ -16,6 +16,8 @@ from rts.operations.operation import Operation
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of two small matrices, in one engine; NumPy's beside another's is a constant."""
+    if type(a) is type(b) is np.ndarray:
+        return a @ b
     engine = engine_of(a, b)
     if type(a) is not type(b):
         a, b = constants(a, engine, b), constants(b, engine, a)

@@ -122,7 +122,7 @@ class TorchEngine(Engine):
 
     def plain(self, x: torch.Tensor) -> bool:
         """True for a dense tensor with values, of a dtype in `_REAL`, while torch's forward mode is off."""
-        return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and not torch_internals.forward_mode()
+        return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and torch_internals.forward_level() < 0
 
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
         """`x`, with its tangent in the dtype of `x`.
@@ -137,7 +137,7 @@ class TorchEngine(Engine):
             raise InputError(f"{name} is a tensor on the device 'meta', which has no values; expected one that has")
         if x.dtype.is_complex:
             raise InputError(f"{name} has dtype {x.dtype}; expected real numbers")
-        return tangent_alike(x) if torch_internals.forward_mode() else x
+        return tangent_alike(x) if torch_internals.forward_level() >= 0 else x
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
 from rts_backends.torch_engine.functions import along, foreign, is_zero
-from rts_backends.torch_engine.torch_internals import differentiated, is_asked_for
+from rts_backends.torch_engine.torch_internals import differentiated, is_asked_for, is_legacy_batchedtensor
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -28,9 +28,14 @@ _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, tor
 def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str, Any]) -> Tensor:
     """The result of an operation: by compiled code if it takes the operands, else by the operation's array code.
 
-    The array code also runs under `torch.compile`, and while other array code is differentiated.
+    It takes floats that are all float32 or all float64, and integers, on the host. The array code also runs under
+    `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
+    real = operands[0].dtype
+    compiled = real in _DTYPES and not _specifying.on and not torch.compiler.is_compiling()
+    for x in operands:
+        compiled = compiled and x.is_cpu and (x.dtype == real or x.dtype in _INTEGERS)
+    if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
     operands, call = tuple(map(Tensor.contiguous, operands)), _Call(operation, params)
@@ -49,20 +54,6 @@ class _Specifying(threading.local):
 
 
 _specifying = _Specifying()
-
-
-def _fits(operands: Sequence[Tensor]) -> bool:
-    """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
-
-    All are on the host.
-    """
-    real = operands[0].dtype
-    if real not in _DTYPES:
-        return False
-    for x in operands:
-        if not x.is_cpu or (x.dtype != real and x.dtype not in _INTEGERS):
-            return False
-    return True
 
 
 class _Call:
@@ -172,15 +163,15 @@ class _Derivatives(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        call, operands = ctx.call, ctx.saved_tensors
+        call, operands, (g,) = ctx.call, ctx.saved_tensors, gradients
         wanted = ctx.needs_input_grad[1 : 1 + call.count]
-        if foreign(*gradients):
+        if is_legacy_batchedtensor(g):
             varied, fixed = call.split(operands)
-            found = call.pulled(wanted, fixed)(*varied, gradients[0])
+            found = call.pulled(wanted, fixed)(*varied, g)
         elif torch.is_grad_enabled() or differentiated():
-            found = _Pull.apply(call, wanted, *operands, gradients[0])
+            found = _Pull.apply(call, wanted, *operands, g)
         else:
-            found = _Pull.forward(call, wanted, *operands, gradients[0])
+            found = _Pull.forward(call, wanted, *operands, g)
         found = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         return None, *found, *[None] * (len(ctx.needs_input_grad) - 1 - call.count)
 

@@ -6,7 +6,7 @@
 - `is_legacy_batchedtensor` finds the batches of `torch.autograd.grad(..., is_grads_batched=True)`.
 - `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
   alone are wanted.
-- `forward_mode` tells whether forward mode is on. Tangents then take the dtype of their tensors.
+- `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
 
 With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
 each value read takes longer.
@@ -15,6 +15,7 @@ each value read takes longer.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -95,11 +96,10 @@ def is_asked_for(ctx: Any, k: int) -> bool:
         return True
 
 
-def forward_mode() -> bool:
-    """True in forward mode; also from a torch that does not tell."""
-    return getattr(forward_ad, "_current_level", 0) >= 0
+forward_level = partial(getattr, forward_ad, "_current_level", 0)
+"""() → the level of forward mode, negative where it is off; 0 from a torch that does not tell."""
 
 
 def differentiated() -> bool:
     """True under a `torch.func` transform, or in forward mode."""
-    return current_level() is not None or getattr(forward_ad, "_current_level", 0) >= 0
+    return current_level() is not None or forward_level() >= 0

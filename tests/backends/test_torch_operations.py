@@ -245,7 +245,7 @@ def test_without_private_names_values_and_gradients_are_the_same(surface, monkey
     with monkeypatch.context() as patch:
         patch.delattr(torch._C._functorch, "is_legacy_batchedtensor")
         importlib.reload(private)
-        patch.setattr(private, "forward_mode", lambda: True)
+        patch.setattr(private, "forward_level", lambda: 0)
         assert private.current_level() == 0
         less = found()
     importlib.reload(private)
