@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace, value_of
-from rts.arrays.trees import STATIC_FIELDS, Array, Tree, is_named, leaves, map_leaves
+from rts.arrays.trees import STATIC_FIELDS, Array, Tree, leaves, map_leaves
 from rts.arrays.value_ranges import largest_absolute
 from rts.errors import EngineError, InputError
 
@@ -47,14 +47,14 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         return entries
     if isinstance(tree, (list, tuple)):
         numbers = [isinstance(x, (bool, int, float)) for x in leaves(tree)]
-        if numbers and all(numbers) and not is_named(tree):
+        if numbers and all(numbers) and not hasattr(tree, "_fields"):
             try:
                 return np.asarray(tree, np.float32)
             except (ValueError, OverflowError):
                 what = " ".join(str(tree).split())[:60]
                 raise InputError(f"{name} is {what}, whose rows have different lengths; expected an array") from None
         items = [from_numbers(x, f"{name}[{i}]") for i, x in enumerate(tree)]
-        return kind(*items) if is_named(tree) else kind(items)
+        return kind(*items) if hasattr(tree, "_fields") else kind(items)
     if kind in STATIC_FIELDS:
         return map_leaves(lambda x: from_numbers(x, name), tree)
     if isinstance(tree, np.generic):

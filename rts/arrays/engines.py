@@ -110,7 +110,13 @@ class Context(NamedTuple):
         """The tree with every NumPy array and number made a constant of the engine."""
         if tree is None or type(tree) in OWNERS:  # The usual case.
             return tree
-        return constants(tree, self.engine, self.like)
+        if type(tree) is np.ndarray:
+            return self.engine.constant(tree, self.like)
+        return map_leaves(self._constant, tree)
+
+    def _constant(self, x: Any) -> Array:
+        owned = type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES)
+        return x if owned else self.engine.constant(x, self.like)
 
 
 def context_of(*trees: Tree) -> Context:
@@ -291,12 +297,4 @@ def stopped(tree: Tree) -> Tree:
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
     """The tree with every NumPy array and number made a constant of the engine; see `Engine.constant`."""
-    if tree is None or type(tree) in OWNERS:
-        return tree
-    if type(tree) is np.ndarray:
-        return engine.constant(tree, like)
-
-    def constant(x: Any) -> Array:
-        return x if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES) else engine.constant(x, like)
-
-    return map_leaves(constant, tree)
+    return Context(engine, like).constants(tree)

@@ -142,8 +142,3 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
             mapped[key] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
         return mapped
     return None
-
-
-def is_named(tree: Tree) -> bool:
-    """True for a named tuple."""
-    return hasattr(tree, "_fields")

@@ -68,7 +68,9 @@ class TorchEngine(Engine):
         if array.dtype != dtype and array.dtype.kind == "f":
             # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
-                array = array.astype(dtype)
+                array = array.astype(dtype, "C")
+            if like is None or like.is_cpu:
+                return torch.from_numpy(array)
         device = _CPU if like is None else like.device
         if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)

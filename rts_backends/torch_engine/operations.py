@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from rts_backends.torch_engine.torch_internals import differentiated, is_asked_f
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
+_REQUIRES_GRAD = attrgetter("requires_grad")
 _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}
 
 
@@ -38,10 +40,12 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    operands, call = tuple(map(Tensor.contiguous, operands)), _Call(operation, params)
+    operands, count = tuple(map(Tensor.contiguous, operands)), operation.differentiable
     if differentiated():
-        return _Value.apply(call, *operands)
-    return _Eager.apply((call, operands[call.count :]), *operands[: call.count])
+        return _Value.apply(_Call(operation, params), *operands)
+    if not (torch.is_grad_enabled() and any(map(_REQUIRES_GRAD, operands[:count]))):
+        return torch.from_numpy(operation.value_on_host(_host(operands), params)[0])
+    return _Eager.apply((_Call(operation, params), operands[count:]), *operands[:count])
 
 
 class _Specifying(threading.local):
