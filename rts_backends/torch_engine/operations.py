@@ -194,7 +194,10 @@ class _Derivatives(torch.autograd.Function):
 
 
 class _Eager(_Derivatives):
-    """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python."""
+    """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python.
+
+    Operands without derivatives come along with the call, since torch takes time for each argument.
+    """
 
     @staticmethod
     def forward(ctx, call_and_fixed, *varied):
