@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
-from rts.plugin_api.arrays import Array, Tree, exemplar, shape_of
+from rts.plugin_api.arrays import Array, Tree, exemplar
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
@@ -105,7 +105,7 @@ class Mesh(TriangleSurface):
         for name in self.reads(theta):
             column = self._columns.get(name, 0)
             check_rows("a mesh", theta, name, self._extents[column // 3])
-            rows, vertices = shape_of(theta[name])[0], shape_of(theta["vertices"])[0]
+            rows, vertices = theta[name].shape[0], theta["vertices"].shape[0]
             if column == 0 and rows > vertices:
                 raise InputError(
                     f"theta[{name!r}] of a mesh has {rows} rows, and there are {vertices} vertices; expected one row a "

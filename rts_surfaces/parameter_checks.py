@@ -56,7 +56,7 @@ def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> Non
         return None if fits else f"(rows, {' or '.join(map(str, widths or 'C'))})"
 
     check_entry(who, theta, name, expected)
-    if (count := shape_of(theta[name])[0]) < rows:
+    if (count := theta[name].shape[0]) < rows:
         raise InputError(
             f"theta[{name!r}] of {who} has {count} rows, but its faces refer to row {rows - 1}; check the indices "
             f"(they count from 0)"

@@ -50,7 +50,7 @@ def smooth_normals(vertices: Array, params: Array, ids: Array, faces: np.ndarray
         faces: (T, 3) integers, all triangles.
     """
     xp = namespace(vertices, params)
-    if xp.finfo(params.dtype).bits < xp.finfo(vertices.dtype).bits:
+    if params.dtype != vertices.dtype and xp.finfo(params.dtype).bits < xp.finfo(vertices.dtype).bits:
         params = xp.astype(params, vertices.dtype)
     return SMOOTH_NORMALS(vertices, params, ids, table_of(faces, vertices))
 

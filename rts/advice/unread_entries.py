@@ -47,8 +47,7 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
     """
     if shaded is None:
         return ()
-    shaped = part.surface.reads(part.theta)
-    return tuple(name for name in part.theta if name not in shaped and name not in shaded)
+    return tuple([name for name in part.theta if name not in part.read and name not in shaded])
 
 
 def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | None:

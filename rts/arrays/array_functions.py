@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace, value_of
-from rts.arrays.trees import STATIC_FIELDS, Array, Tree, is_named, leaves, map_leaves
+from rts.arrays.trees import STATIC_FIELDS, Array, Tree, leaves, map_leaves
+from rts.arrays.value_ranges import largest_absolute
 from rts.errors import EngineError, InputError
 
 
@@ -46,14 +47,14 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         return entries
     if isinstance(tree, (list, tuple)):
         numbers = [isinstance(x, (bool, int, float)) for x in leaves(tree)]
-        if numbers and all(numbers) and not is_named(tree):
+        if numbers and all(numbers) and not hasattr(tree, "_fields"):
             try:
                 return np.asarray(tree, np.float32)
             except (ValueError, OverflowError):
                 what = " ".join(str(tree).split())[:60]
                 raise InputError(f"{name} is {what}, whose rows have different lengths; expected an array") from None
         items = [from_numbers(x, f"{name}[{i}]") for i, x in enumerate(tree)]
-        return kind(*items) if is_named(tree) else kind(items)
+        return kind(*items) if hasattr(tree, "_fields") else kind(items)
     if kind in STATIC_FIELDS:
         return map_leaves(lambda x: from_numbers(x, name), tree)
     if isinstance(tree, np.generic):
@@ -122,12 +123,8 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
     they become floating constants like the widest of those, which stay as they are. A list of scalar arrays is stacked.
     """
     owner = OWNERS.get(type(values[0]))
-    if owner is not None:
-        for v in values:
-            if OWNERS.get(type(v)) is not owner:
-                break
-        else:
-            return owner.namespace, list(values)
+    if owner is not None and len({*map(type, values)}) == 1:
+        return owner.namespace, list(values)
     values_ = [
         np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values
     ]
@@ -170,25 +167,21 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
     Quick if it is true.
     """
     for x in arrays:
-        if not _is_finite(x, below):
+        engine = OWNERS.get(type(x)) or engine_of(x)
+        if not engine.on_host(x):
+            below_all = value_of(engine.namespace.all(abs(x) < below))
+            if below_all is not None and not below_all.all():
+                return False
+            continue
+        values = engine.known(x)
+        if values is None or not values.size:
+            continue
+        # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
+        if 0 in values.strides:
+            values = values[tuple([slice(None) if step else slice(1) for step in values.strides])]
+        if not largest_absolute(values) < below:
             return False
     return True
-
-
-def _is_finite(x: Array, below: float) -> bool:
-    engine = engine_of(x)
-    if not engine.on_host(x):
-        values = value_of(engine.namespace.all(abs(x) < below))
-        return values is None or bool(values.all())
-    values = engine.known(x)
-    if values is None or not values.size:
-        return True
-    from rts.arrays.value_ranges import largest_absolute
-
-    # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
-    if 0 in values.strides:
-        values = values[tuple([slice(None) if step else slice(1) for step in values.strides])]
-    return largest_absolute(values) < below
 
 
 def averaged(image: Array, factor: int) -> Array:

@@ -6,6 +6,7 @@ import functools
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -22,12 +23,7 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 def is_constant(tree: Tree) -> bool:
     """True if every leaf is a NumPy array or a Python number, which are never differentiated."""
-    if type(tree) in OWNERS:
-        return False
-    for x in collected(tree):
-        if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES):
-            return False
-    return True
+    return type(tree) not in OWNERS and all(map(isinstance, collected(tree), repeat(CONSTANT_TYPES)))
 
 
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
@@ -114,7 +110,13 @@ class Context(NamedTuple):
         """The tree with every NumPy array and number made a constant of the engine."""
         if tree is None or type(tree) in OWNERS:  # The usual case.
             return tree
-        return constants(tree, self.engine, self.like)
+        if type(tree) is np.ndarray:
+            return self.engine.constant(tree, self.like)
+        return map_leaves(self._constant, tree)
+
+    def _constant(self, x: Any) -> Array:
+        owned = type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES)
+        return x if owned else self.engine.constant(x, self.like)
 
 
 def context_of(*trees: Tree) -> Context:
@@ -242,7 +244,8 @@ def host_value(x: Array) -> np.ndarray:
     """The value of an array, which is not traced."""
     if type(x) is np.ndarray:
         return x
-    value = value_of(x)
+    owner = OWNERS.get(type(x))
+    value = value_of(x) if owner is None else owner.known(x)
     assert value is not None
     return value
 
@@ -286,17 +289,12 @@ def stopped(tree: Tree) -> Tree:
     """A copy of a tree without derivatives, so that results computed from it keep no graph."""
     if type(tree) is np.ndarray:
         return tree
+    owner = OWNERS.get(type(tree))
+    if owner is not None:
+        return owner.stop_gradient(tree)
     return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
     """The tree with every NumPy array and number made a constant of the engine; see `Engine.constant`."""
-    if tree is None or type(tree) in OWNERS:
-        return tree
-    if type(tree) is np.ndarray:
-        return engine.constant(tree, like)
-
-    def constant(x: Any) -> Array:
-        return x if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES) else engine.constant(x, like)
-
-    return map_leaves(constant, tree)
+    return Context(engine, like).constants(tree)

@@ -38,14 +38,10 @@ def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
     return decorate
 
 
-def record_arrays(value: Any) -> list[Any]:
-    """A record's array fields in order of declaration."""
-    return list(map(value.__dict__.__getitem__, _ARRAY_FIELDS[type(value)]))
-
-
 def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in the order of `STATIC_FIELDS`."""
-    return record_arrays(value), tuple(map(value.__dict__.__getitem__, STATIC_FIELDS[type(value)]))
+    arrays, static = (map(value.__dict__.__getitem__, of[type(value)]) for of in (_ARRAY_FIELDS, STATIC_FIELDS))
+    return list(arrays), tuple(static)
 
 
 def join_record(cls: type, arrays: Iterable[Any], static: tuple[Any, ...]) -> Any:
@@ -74,11 +70,11 @@ def collected(tree: Tree) -> list[Any]:
         if kind == _LEAF:
             arrays.append(x)
         elif kind == _RECORD:
-            rest.extend(record_arrays(x)[::-1])
+            rest.extend(map(x.__dict__.__getitem__, _ARRAY_FIELDS[type(x)][::-1]))
         elif kind == _SEQUENCE:
             rest.extend(x[::-1])
         elif kind == _MAPPING:
-            rest.extend([x[key] for key in sorted(x, reverse=True)])
+            rest.extend(map(x.__getitem__, sorted(x, reverse=True)))
     return arrays
 
 
@@ -127,7 +123,9 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
         copy, values = object.__new__(type(tree)), tree.__dict__
         for name in _ARRAY_FIELDS[type(tree)]:
             item = values[name]
-            copy.__dict__[name] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
+            if item is not None:
+                item = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
+            copy.__dict__[name] = item
         for name in STATIC_FIELDS[type(tree)]:
             copy.__dict__[name] = values[name]
         return copy
@@ -136,7 +134,7 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
         for item in tree:
             items.append(fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item))
         cls = type(tree)
-        return items if cls is list else (cls(*items) if is_named(tree) else cls(items))
+        return items if cls is list else (cls(*items) if hasattr(tree, "_fields") else cls(items))
     if kind == _MAPPING:
         mapped = {}
         for key in sorted(tree):
@@ -144,8 +142,3 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
             mapped[key] = fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item)
         return mapped
     return None
-
-
-def is_named(tree: Tree) -> bool:
-    """True for a named tuple."""
-    return hasattr(tree, "_fields")

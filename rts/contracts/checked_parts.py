@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
 def listed_parts(parts: Any) -> list[Part]:
     """A list of one part, or of several; anything else raises an `InputError`."""
     part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
-    if not part_list or not all(isinstance(p, Part) for p in part_list):
+    if not part_list or not all(map(isinstance, part_list, repeat(Part))):
         kinds = ", ".join(sorted({type(p).__name__ for p in part_list})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     return part_list
@@ -104,7 +105,8 @@ def check_cameras(cameras: Any) -> list[Camera]:
 
 def _check_camera(camera: Camera) -> Camera:
     """The camera with arrays for matrices, turned to look along −z if it looks along +z; a traced one stays."""
-    view, projection = (check_matrix(f"the camera's {n}", getattr(camera, n)) for n in ("view", "projection"))
+    view = check_matrix("the camera's view", camera.view)
+    projection = check_matrix("the camera's projection", camera.projection)
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
     sign = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])

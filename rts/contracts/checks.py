@@ -109,7 +109,7 @@ def checked_plugin(plugin: Any, what: str, base: type, others: str = "a name, ")
 def check_matrix(name: str, matrix: Any) -> Array:
     """A (4, 4) matrix of floating numbers: lists become float32, NumPy integers float64. Other arrays are refused."""
     matrix = from_numbers(matrix, name)
-    if shape_of(matrix) != (4, 4):
+    if getattr(matrix, "shape", ()) != (4, 4):
         several = len(shape_of(matrix)) == 3 and shape_of(matrix)[1:] == (4, 4)
         hint = "; for several views call rts.render_views, for several poses vmap of rts.render" if several else ""
         raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array{hint}")
@@ -165,7 +165,8 @@ def check_memory(height: int, width: int, layers: int, capacity: int | None, *, 
 
 def is_count(value: Any) -> bool:
     """True for an integer of at least 1, Python's or NumPy's."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
+    whole = type(value) is int or (isinstance(value, Integral) and not isinstance(value, bool))
+    return whole and int(value) >= 1
 
 
 def is_real(value: Any) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from rts.errors import InputError
@@ -55,6 +56,15 @@ class GBuffer(dict):
         """Add an attribute that is computed by `compute()` when first read."""
         self._deferred[name] = compute
 
+    def changed(self, changes: Mapping[str, Callable[[Any], Any]]) -> GBuffer:
+        """A G-buffer of the same attributes, of which `changes` turns some into others; all are computed when read."""
+        other = GBuffer()
+        other.like = self.like
+        for name in self:
+            read, change = partial(self.__getitem__, name), changes.get(name)
+            other._deferred[name] = read if change is None else lambda read=read, change=change: change(read())
+        return other
+
     def unit(self, name: str) -> Any:
         """An attribute of vectors (N, 3), scaled to length one; a zero vector stays zero.
 
@@ -82,4 +92,4 @@ class GBuffer(dict):
         return super().__contains__(name) or name in self._deferred
 
     def __iter__(self) -> Iterator[str]:
-        yield from dict.fromkeys([*super().__iter__(), *self._deferred])
+        return iter(dict.fromkeys([*super().__iter__(), *self._deferred]))

@@ -58,7 +58,7 @@ def check_splats(
         row: (K, H, W) int32, the row of each cell's sample, counted over all parts.
         first: the first row of this part.
     """
-    if is_finite(positions) and is_finite(rgba, below=BRIGHTEST):
+    if is_finite(positions, rgba, below=BRIGHTEST):
         return
     rows = value_of(row)
     if rows is None:

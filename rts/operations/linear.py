@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.engines import constants, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.by_view import index_of_views, operation_of_views
@@ -16,9 +16,11 @@ from rts.operations.operation import Operation
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of two small matrices, in one engine; NumPy's beside another's is a constant."""
+    if type(a) is type(b) is np.ndarray:
+        return a @ b
     engine = engine_of(a, b)
     if type(a) is not type(b):
-        a, b = constants((a, b), engine, exemplar(a, b))
+        a, b = constants(a, engine, b), constants(b, engine, a)
     return engine.product(a, b)
 
 

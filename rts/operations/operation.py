@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
+from functools import cache
+from itertools import repeat
+from operator import attrgetter, is_not
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from rts.compiling.threads import read_only
 from rts.errors import InputError, InputWarning, RtsError, warn
 
 _SHAPE = attrgetter("shape")
+_WHOLE = {int, np.int32, np.int64}
 
 
 def _in_words(shapes: Iterable[tuple[int, ...]]) -> str:
@@ -112,7 +115,7 @@ class Operation:
             specification: as the attribute.
             ranks: as the attribute.
             shape: as the attribute.
-            loops: () → (forward, push, pull); called each time, so that it may import numba on first use.
+            loops: () → (forward, push, pull); called once, on first use, so that it may import numba then.
                 forward(*operands, out, **params) and push(*operands, *tangents, out, **params) fill `out`;
                 pull(*operands, gradient, *results, **params) fills the results, of which not all are None.
             check: (*operands, **params), raises an InputError if operands do not fit one another.
@@ -121,22 +124,21 @@ class Operation:
         Raises:
             InputError: an attribute is not of its kind.
         """
-
-        def fitting(operands: Arrays, params: dict[str, Any]) -> Arrays:
-            if check is not None:
-                check(*operands, **params)
-            return operands
+        known, checked = cache(loops), check or (lambda *_, **__: None)
 
         def forward(operands: Arrays, out: np.ndarray, **params: Any) -> Any:
-            return loops()[0](*fitting(operands, params), out, **params)
+            checked(*operands, **params)
+            return known()[0](*operands, out, **params)
 
         def push(operands: Arrays, tangents: Some, out: np.ndarray, **params: Any) -> None:
             along = [None if t is None else read_only(t) for t in tangents]
-            loops()[1](*fitting(operands, params), *along, out, **params)
+            checked(*operands, **params)
+            known()[1](*operands, *along, out, **params)
 
         def pull(operands: Arrays, gradient: np.ndarray, results: Some, **params: Any) -> None:
-            if any(x is not None for x in results):
-                loops()[2](*fitting(operands, params), read_only(gradient), *results, **params)
+            if any(map(is_not, results, repeat(None))):
+                checked(*operands, **params)
+                known()[2](*operands, read_only(gradient), *results, **params)
 
         return cls(name, specification, ranks, shape, forward, push, pull, **options)
 
@@ -193,13 +195,12 @@ class Operation:
                 f"the operation {self.name} takes {len(self.ranks)} operands; it was given {len(operands)}"
             )
         kind = type(operands[0])
-        for x in operands:
-            if type(x) is not kind:
+        owner: Any = engine_of() if kind is np.ndarray else OWNERS.get(kind)
+        for x, rank in zip(operands, self.ranks, strict=True):
+            if type(x) is not kind or owner is None or x.ndim != rank:
                 break
         else:
-            if kind in OWNERS or kind is np.ndarray:
-                self.check_ranks(operands)
-                return engine_of(operands[0]).apply(self, operands, params)
+            return owner.apply(self, operands, params)
         operands = tuple([from_numbers(x, f"an operand of {self.name}") for x in operands])
         if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
             kinds = ", ".join(map(kind_of, operands))
@@ -243,26 +244,23 @@ class Operation:
             result = self.shape(*shapes, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("shape", shapes, error) from error
-        if type(result) is not tuple or not all([isinstance(n, (int, np.integer)) and n >= 0 for n in result]):
+        if type(result) is not tuple or not _WHOLE.issuperset(map(type, result)) or min(result, default=0) < 0:
             raise InputError(
                 f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes "
                 f"{_in_words(shapes)}; expected a tuple of integers of at least 0"
             )
         return result
 
-    def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
-        """The result, and the object that `forward` keeps for the derivatives, or None."""
-        out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
-        return out, self.forward_on_host(operands, out, params)
-
-    def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
-        """Fill `out` with the value, and return the object that `forward` keeps for the derivatives.
+    def value_on_host(self, operands: Arrays, params: Mapping[str, Any], out: Any = None) -> tuple[np.ndarray, Any]:
+        """The result, in `out` if it is given, and the object that `forward` keeps for the derivatives, or None.
 
         Raises:
             InputError: `forward` cannot take the operands.
         """
+        if out is None:
+            out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         try:
-            return self.forward(operands, out, **params)
+            return out, self.forward(operands, out, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("forward", list(map(_SHAPE, operands)), error) from error
 

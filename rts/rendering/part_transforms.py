@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, exemplar, namespace
+from rts.arrays.engines import Context, engine_of, exemplar, namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.by_view import index_of_views
 from rts.operations.linear import affine_map, affine_map_of_views
 from rts.operations.take import take
 
 
-class OneTransform(NamedTuple):
+@dataclass(frozen=True)
+class OneTransform:
     """A transform for all samples.
 
     Attributes:
@@ -27,17 +29,27 @@ class OneTransform(NamedTuple):
         """Points (N, 3), moved."""
         return affine_map(self.matrix[:3, :], points)
 
-    def normals(self, normals: Array) -> Array:
-        """Normals (N, 3), of any length, moved: times the cofactor matrix; a mirror keeps them outward."""
-        return affine_map(_linear(_cofactors(self.matrix)[0]), normals)
+    @cached_property
+    def cofactors(self) -> tuple[Array, Array]:
+        """See `_cofactors`."""
+        return _cofactors(self.matrix)
+
+    def normals(self, normals: Array, moving: bool = True) -> Array:
+        """Normals (N, 3), of any length, moved: times the cofactor matrix; a mirror keeps them outward.
+
+        If they are not `moving`, without the derivative in the transform.
+        """
+        rows = _linear(self.cofactors[0])
+        return affine_map(rows if moving else stopped(rows), normals)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), of any length, moved; a mirror changes the signs."""
         moved = affine_map(_linear(self.matrix[:3, :3]), tangents[:, :3])
-        return namespace(moved).concat([moved, tangents[:, 3:] * _cofactors(self.matrix)[1][:, 0]], axis=1)
+        return namespace(moved).concat([moved, tangents[:, 3:] * self.cofactors[1][:, 0]], axis=1)
 
 
-class ViewTransforms(NamedTuple):
+@dataclass(frozen=True)
+class ViewTransforms:
     """A transform for each of N samples, of parts in several views; methods as of `OneTransform`.
 
     Attributes:
@@ -60,9 +72,10 @@ class ViewTransforms(NamedTuple):
         """Points (N, 3), moved."""
         return affine_map_of_views(self.matrices[:, :3, :], points, self.view)
 
-    def normals(self, normals: Array) -> Array:
+    def normals(self, normals: Array, moving: bool = True) -> Array:
         """Normals (N, 3), moved."""
-        return self._turned(_cofactors(self.matrices)[0], normals)
+        matrices = _cofactors(self.matrices)[0]
+        return self._turned(matrices if moving else stopped(matrices), normals)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), moved."""

@@ -83,7 +83,8 @@ def sampled_scene(
     factor, capacity = settings.supersample, settings.capacity
     height, width = factor * size[0], factor * size[1]
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
-    grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
+    apron, outlines = settings.apron, settings.finds_outlines
+    grid = Grid.sampled(scene, camera, (height, width), apron)
     given, (scene, grid) = scene, on_the_host(scene, grid)
     if scene.cameras and capacity is None and not settings.fronts:
         scene = with_joints(scene, grid)
@@ -95,7 +96,7 @@ def sampled_scene(
     if outlines and layers != "auto" and not settings.fronts:
         sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
-        return replace(sampled, supersample=factor, apron=settings.apron)
+        return replace(sampled, supersample=factor, apron=apron)
 
     def taken(count: int) -> Sampled:
         if not outlines or capacity is not None:  # A capacity promises so many rows.
@@ -107,10 +108,10 @@ def sampled_scene(
     while True:
         sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)
         if outlines:
-            triangle = sampled.triangle if settings.fronts else None
-            sampled = with_outlines(sampled, scene, grid, told, capacity).replace(triangle=triangle)
+            triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, told, capacity)
+            sampled = sampled.replace(triangle=triangle) if settings.fronts else sampled
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):
             break
         least = 2 * sampled.row.shape[-3]
-    sampled = replace(sampled, supersample=factor, apron=settings.apron)
+    sampled = replace(sampled, supersample=factor, apron=apron)
     return in_engine(sampled, given) if scene.cameras and not stays else sampled

@@ -70,13 +70,14 @@ class RenderSettings:
 
     def of(self, scene: Scene) -> RenderSettings:
         """The settings with the number of layers that the splatter reads of a scene; "auto" where it is to be found."""
-        layers, opaque = self.layers, all(scene.opaque)
-        if layers == "auto" and scene.traced:
+        layers, opaque, splatter, most = self.layers, all(scene.opaque), self.splatter, None
+        if splatter is not None and (opaque or not promised(splatter, "translucent")):
+            most = splatter.layers
+        if layers == "auto" and most != 1 and scene.traced:
             layers = TRACED_LAYERS[opaque]
-        splatter = self.splatter
-        if splatter is not None and splatter.layers is not None and (opaque or not promised(splatter, "translucent")):
-            layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))
-        return replace(self, layers=layers)
+        if most is not None:
+            layers = most if layers == "auto" else min(most, int(layers))
+        return self if layers == self.layers else replace(self, layers=layers)
 
     @property
     def finds_outlines(self) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 from rts.arrays.array_functions import kind_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import Context, is_constant, stopped
+from rts.arrays.engines import Context, is_constant
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
@@ -203,27 +203,13 @@ def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
     """The G-buffer for shaders: unused rows hold values with finite derivatives, too."""
     if not engine.padded(samples.row):
         return gbuffer
-    readable = GBuffer()
-    readable.like = gbuffer["position"]
-    for name in gbuffer:
-        readable.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
-    return readable
+    return gbuffer.changed(dict.fromkeys(gbuffer, lambda x: engine.fill_unused(x, samples.row)))
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:
     """The G-buffer with positions, normals and tangents moved by the part's transform."""
     if transform is None:
         return gbuffer
-    world = GBuffer()
-    world.like = gbuffer.like
-    for name in gbuffer:
-        world.defer(name, lambda name=name: gbuffer[name])
     moves = transform if isinstance(transform, ViewTransforms) else OneTransform(transform)
-    world.defer("position", lambda: moves.points(gbuffer["position"]))
-    if "normal" in gbuffer:
-        world.defer("normal", lambda: moves.normals(gbuffer["normal"]))
-    if "face_normal" in gbuffer:
-        world.defer("face_normal", lambda: stopped(moves).normals(gbuffer["face_normal"]))
-    if TANGENT in gbuffer:
-        world.defer(TANGENT, lambda: moves.tangents(gbuffer[TANGENT]))
-    return world
+    changes = {"position": moves.points, "normal": moves.normals, TANGENT: moves.tangents}
+    return gbuffer.changed({**changes, "face_normal": partial(moves.normals, moving=False)})

@@ -13,6 +13,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, Cells, Sampled, Samples, Splats, Stencil
 from rts.contracts.result_checks import check_splats
 from rts.errors import InputError
+from rts.operations.projection import projective_map
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
 from rts.sampling.scene import Grid
 from rts.scene.camera import Camera
@@ -96,7 +97,8 @@ def _positions_and_colors(
         padded = stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
         used = all_in_use(samples, inputs, stencil, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
-        positions.append(context.constants(local_camera.project(on_rays(samples, local["position"]), grid.size)))
+        placed = projective_map(local_camera.pixel_rows(grid.size), on_rays(samples, local["position"]))
+        positions.append(context.constants(placed))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(context.constants(rgba))
         first += samples.ids.shape[-2]

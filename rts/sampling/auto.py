@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from rts import registry
 from rts.arrays.engines import engine_of, is_constant
-from rts.contracts.checks import check_sampler
 from rts.contracts.records import Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
@@ -76,7 +75,7 @@ class Auto(Sampler):
         """See `rts.Sampler`."""
         choice = choose(part, static=camera is None or is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
-        return check_sampler(choice.sampler)
+        return registry.instance("rts.samplers", choice.sampler)
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from rts.arrays.argument_checks import is_invertible
 from rts.arrays.engines import host_value
-from rts.arrays.trees import Array
 from rts.arrays.value_ranges import largest_absolute
 from rts.errors import InputError
 from rts.scene.camera import Camera
@@ -19,11 +18,8 @@ def on_host(camera: Camera) -> Camera:
     if type(camera.view) is type(camera.projection) is np.ndarray:
         if camera.view.dtype == camera.projection.dtype == np.float64:
             return camera
-    return camera.replace(view=_matrix(camera.view), projection=_matrix(camera.projection))
-
-
-def _matrix(x: Array) -> np.ndarray:
-    return np.asarray(host_value(x), np.float64)
+    view, projection = host_value(camera.view), host_value(camera.projection)
+    return camera.replace(view=np.asarray(view, np.float64), projection=np.asarray(projection, np.float64))
 
 
 WELL_CONDITIONED = 1e-6

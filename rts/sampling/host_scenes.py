@@ -6,6 +6,7 @@ Samples that are found there become arrays of that engine.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -28,9 +29,9 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     Only entries are added for engines that pad; nothing where values are traced, or several at once, or where a sampler
     has a way of its own.
     """
-    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
+    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene):
         return scene, grid
-    here, cells = from_values(scene, grid.size, map_leaves(host_value, values_of(scene, grid)))
+    here, cells = from_values(scene, grid.size, values_of(scene, grid))
     like = scene.context.like
     if like is not None and scene.context.engine.padded(like):
         return scene._replace(entries=here.entries), grid
@@ -48,17 +49,17 @@ def values_of(scene: Scene, grid: Grid) -> Tree:
 
 
 def from_values(scene: Scene, size: tuple[int, int], values: Tree) -> tuple[Scene, Grid]:
-    """The scene on the host, and its cells, from the values of `values_of`, as NumPy arrays.
+    """The scene on the host, and its cells, from the values of `values_of`, none of which is traced.
 
     An InputError if a camera makes no image.
     """
     entries, cameras, (camera, of_parts) = [], [], values
     for part, sampler, entry, given in zip(scene.parts, scene.samplers, scene.entries, of_parts, strict=True):
         seen, transform, inputs = given
-        seen = check_camera(on_host(seen), transform)
+        seen = check_camera(on_host(seen), None if transform is None else host_value(transform))
         if entry is None:
             assert isinstance(sampler, TriangleSampler)
-            entry = entry_of(part, sampler, inputs, seen, size)
+            entry = entry_of(part, sampler, map_leaves(host_value, inputs), seen, size)
         entries.append(entry)
         cameras.append(seen)
     parts = [replace(part, theta={}, transform=None) for part in scene.parts]
@@ -71,7 +72,7 @@ def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:
     """True if a part's triangles are all that its sampler asks of it, and stay as they are made."""
     if not (isinstance(sampler, TriangleSampler) and isinstance(part.surface, TriangleSurface)):
         return False
-    return not any(overrides(sampler, name, TriangleSampler) for name in ("sample", "update"))
+    return not overrides(sampler, "sample", TriangleSampler) and not overrides(sampler, "update", TriangleSampler)
 
 
 def real_of(scene: Scene) -> type:
@@ -90,13 +91,14 @@ def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
         return sampled
     samples = [_evaluated(*one, real_of(scene)) for one in zip(scene.parts, sampled.samples, strict=True)]
     sampled = replace(sampled, samples=tuple(samples))
-    arrays = {id(x): x for x in collected(sampled)}  # Some stand in it twice, such as the cells of a single part.
+    leaves = collected(sampled)
+    arrays = dict(zip(map(id, leaves), leaves, strict=True))  # Some stand in it twice, as the cells of a single part.
     specs = [ArraySpec(x.shape, x.dtype) for x in arrays.values()]
     # None of its numbers cross: it only says where to.
     place = [] if like is None else [namespace(like).reshape(like, (-1,))[:0]]
     results = engine.call_host(lambda *_: list(arrays.values()), specs, *place)
     moved = dict(zip(arrays, results, strict=True))
-    return map_leaves(lambda x: moved[id(x)], sampled)
+    return map_leaves(partial(next, map(moved.__getitem__, map(id, leaves))), sampled)
 
 
 def _evaluated(part: CheckedPart, samples: Samples, real: type) -> Samples:

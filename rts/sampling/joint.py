@@ -78,7 +78,7 @@ class Joint:
         cls, camera: Camera, scene: Scene, first: int, proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]
     ) -> Joint:
         """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
-        starts = np.cumsum([0, *(len(proxy.faces) for proxy in proxies)], dtype=np.int32)
+        starts = np.array([0, *itertools.accumulate(len(proxy.faces) for proxy in proxies)], np.int32)
         sampler, proxy = scene.samplers[first], proxies[0]
         assert isinstance(sampler, TriangleSampler)
         ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
@@ -128,7 +128,7 @@ class Joint:
         row, first = packing_loops.parts_of(fragments.triangle_ids, covered, self.starts)
         table, seen = self.proxy, first[first >= 0]
         assert table.ids is not None
-        one = Fragments(*(x.reshape(1, 1, row.size, *x.shape[3:])[:, :, seen] for x in fragments))
+        one = Fragments(*[x.reshape(1, 1, row.size, *x.shape[3:])[:, :, seen] for x in fragments])
         known = np.ones((1, 1, len(seen)), np.bool_), table.ids, table.corner_params
         counts, ids, params, *_ = packing_loops.pack(one, *known, starts=self.starts)
         depth = np.where(covered, fragments.depth, np.float32(0))
@@ -154,7 +154,7 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
     These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
     """
     suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
-    if not any(suited) or not all(map(has_sheets, scene.parts, scene.samplers)):
+    if not all(suited) and not (any(suited) and all(map(has_sheets, scene.parts, scene.samplers))):
         return scene
     joints = []
     runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))

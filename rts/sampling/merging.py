@@ -33,9 +33,9 @@ def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, of_op
     while number < len(scene.parts):
         joint = joints.get(number)
         if joint is not None:
-            most = max(of_parts[number : joint.stop])  # They are drawn at once.
+            first, number = number, joint.stop
+            most = max(of_parts[first:number])  # They are drawn at once.
             tables.append(joint.sampled(grid.size, most, request.triangles, request.uniform))
-            number = joint.stop
             continue
         part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
         camera = scene.local_camera(number, grid)

@@ -41,16 +41,16 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     check_faces(Proxy(vertices, faces), surface)
     none = proxy.ids is None and not surface.refines and surface.sample_widths[0] == 0
     ids = np.zeros((len(faces), 0), np.int32) if none else proxy.ids
-    ids = None if ids is None else _table(surface, "ids", ids, (-1,), np.int32)
+    ids = ids if ids is None or ids is faces else _table(surface, "ids", ids, (-1,), np.int32)
     corners = proxy.corner_params
     corners = None if corners is None else _table(surface, "corner_params", corners, (3, -1), np.float32)
     width = 3 if ids is None else ids.shape[1]
-    if not surface.refines and width != surface.sample_widths[0]:
+    if width != surface.sample_widths[0] and not surface.refines:
         raise InputError(
             f"the proxy of {surface!r} has {width} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
         )
     width = 2 if corners is None else corners.shape[2]
-    if not surface.refines and width != surface.sample_widths[1]:
+    if width != surface.sample_widths[1] and not surface.refines:
         corner_text = (
             "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
         )
@@ -169,7 +169,7 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
     """
     if isinstance(fragments, Fragments):
         ids, barycentrics, depth = fragments
-        fits = shape_of(ids) == shape_of(depth) == shape and shape_of(barycentrics) == (*shape, 2)
+        fits = [getattr(x, "shape", ()) for x in (ids, depth, barycentrics)] == [shape, shape, (*shape, 2)]
     else:
         fits = False
     if not fits:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from rts.advice.bright_textures import warn_of_bright_textures
@@ -19,6 +20,8 @@ from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
+
+_OPAQUE, _READ = attrgetter("shader.opaque"), attrgetter("read")
 
 
 class Scene(NamedTuple):
@@ -50,12 +53,12 @@ class Scene(NamedTuple):
     @property
     def opaque(self) -> list[bool]:
         """For each part, whether its shader promises to be opaque."""
-        return [bool(part.shader.opaque) for part in self.parts]
+        return list(map(bool, map(_OPAQUE, self.parts)))
 
     @property
     def read(self) -> list[dict[str, Tree]]:
         """The entries of each part's θ that its surface reads."""
-        return [part.read for part in self.parts]
+        return list(map(_READ, self.parts))
 
     @property
     def traced(self) -> bool:
@@ -114,13 +117,13 @@ class Grid(NamedTuple):
     @classmethod
     def around(cls, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
         """The grid of an image of cells (height, width) with an apron."""
-        return cls(camera.with_apron(size, apron), (size[0] + 2 * apron, size[1] + 2 * apron))
+        whole = size[0] + 2 * apron, size[1] + 2 * apron
+        return cls(camera.window(size, (-apron, -apron), whole), whole)
 
     @classmethod
     def sampled(cls, scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """The grid `around` an image, for sampling a scene: the camera is a constant of the scene's engine."""
+        """The grid `around` an image, for sampling a scene: the view is an array of the scene's engine."""
         # One engine samples every part, through the same matrices that later project the samples.
-        wide = cls.around(camera, size, apron)
-        if not scene.context.engine.differentiates:
-            return wide
-        return wide._replace(camera=scene.context.constants(wide.camera))
+        if scene.context.engine.differentiates:
+            camera = camera.replace(view=scene.context.constants(camera.view))
+        return cls.around(camera, size, apron)

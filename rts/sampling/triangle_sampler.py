@@ -154,7 +154,7 @@ class TriangleSampler(Sampler):
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
-            if not self._follows or old.prepared is None:
+            if not overrides(self, "update", TriangleSampler) or old.prepared is None:
                 return None
             proxy = checked_proxy(surface, inputs, camera, size)
             if not same_faces(old.proxy, proxy):
@@ -228,12 +228,7 @@ class TriangleSampler(Sampler):
     @property
     def draws_at_once(self) -> bool:
         """True if several threads may draw one prepared entry at once."""
-        return self.concurrent and not self._follows
-
-    @property
-    def _follows(self) -> bool:
-        """True if the sampler can adapt a prepared entry to moved vertices."""
-        return overrides(self, "update", TriangleSampler)
+        return self.concurrent and not overrides(self, "update", TriangleSampler)
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:

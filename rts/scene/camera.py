@@ -20,7 +20,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, check_pixels, is_invertible, quoted
 from rts.arrays.array_functions import described, from_numbers, promote, shape_of
-from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, uncompiled, value_of
+from rts.arrays.engines import engine_of, is_constant, load_engines, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves, record
 from rts.errors import InputError
 from rts.operations.linear import affine, affine_map, matmul
@@ -129,7 +129,7 @@ class Camera(CameraConverters):
     @property
     def is_stacked(self) -> bool:
         """True for a camera of several views."""
-        return len(shape_of(self.view)) == 3 or len(shape_of(self.projection)) == 3
+        return 3 in (getattr(self.view, "ndim", 0), getattr(self.projection, "ndim", 0))
 
     # ---------------------------------------------------------------------------------------- constructors
 
@@ -253,7 +253,7 @@ class Camera(CameraConverters):
 
     def for_size(self, size: tuple[int, int]) -> Camera:
         """The camera for images of a size (height, width): itself, or a copy of that ratio if `aspect` is "open"."""
-        if self.aspect is None or isinstance(self.aspect, Real):
+        if self.aspect is None or type(self.aspect) is float or isinstance(self.aspect, Real):
             return self
         if not (isinstance(self.aspect, str) and self.aspect == "open"):
             raise InputError(f"aspect is {quoted(self.aspect)}; expected width over height, 'open' or None")
@@ -270,7 +270,7 @@ class Camera(CameraConverters):
         """This camera in the local space of a part with a world-from-local transform (4, 4); None is the identity."""
         if transform is None:
             return self
-        if shape_of(transform) != (4, 4):
+        if getattr(transform, "shape", ()) != (4, 4):
             check_numbers("transform", transform, (4, 4))
         _, (view, transform) = promote(self.view, transform)
         return self.replace(view=matmul(view, transform))
@@ -298,7 +298,6 @@ class Camera(CameraConverters):
                 [0, 0, 0, 1],
             ]
         )
-        change = engine_of(self.projection).constant(change, self.projection)
         aspect = self.aspect
         if isinstance(aspect, float):
             aspect *= (columns * height) / (rows * width)
@@ -328,10 +327,8 @@ class Camera(CameraConverters):
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
         depth[3, 2] = -1
-        engine, view_engine = engine_of(p), engine_of(self.view)
         # Products of constant matrices are computed in NumPy.
-        rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
-        return matmul(constants(rows, view_engine, None if is_constant(self.view) else self.view), self.view)
+        return matmul(matmul(from_clip, p) + engine_of(p).constant(depth, p), self.view)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""
@@ -445,7 +442,7 @@ def toward_rows(view: Array, projection: Array) -> Array:
 
 def world_vectors(view: Array, direction: Sequence[float]) -> Array:
     """Unit vectors (…, 3) in the world of a direction (3,) in the space of cameras with these views (…, 4, 4)."""
-    return unit(sum(c * view[..., i, :3] for i, c in enumerate(direction)))
+    return unit(sum([c * view[..., i, :3] for i, c in enumerate(direction)]))
 
 
 def _known_ratio(aspect: Any) -> float | Literal["open"] | None:

@@ -39,13 +39,13 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
         if is_constant(pose):
             pose = np.asarray(pose, np.float64)
     if center is ORIGIN:
-        center = engine_of(pose).constant(np.zeros(3), pose)
+        center = engine_of(pose).constant(np.zeros(3, np.float32), pose)
     elif shape_of(center) != (3,):
         check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
-    for name, value in ("pose", pose), ("center", center):
-        if not is_finite(value):
-            raise InputError(f"{name} of rts.rigid holds NaN or infinity; expected finite numbers")
+    if not is_finite(pose, center):
+        name = "center" if is_finite(pose) else "pose"
+        raise InputError(f"{name} of rts.rigid holds NaN or infinity; expected finite numbers")
     return RIGID(pose, center)
 
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, dot, shape_of
-from rts.arrays.engines import engine_of, is_constant, namespace, value_of
-from rts.arrays.trees import Array, Tree, map_leaves
+from rts.arrays.engines import namespace, stopped, value_of
+from rts.arrays.trees import Array, Tree
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
@@ -242,12 +242,11 @@ def is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
     Near the outlines of a mesh, normals that are interpolated over a triangle turn away before the triangle does. So
     "face_normal", on either side of the triangle, tells which side is seen, if there is one.
     """
-    face = gbuffer["face_normal"] if "face_normal" in gbuffer else None
-    arrays = gbuffer["position"], gbuffer["normal"], face, camera
-    engine = engine_of(arrays)
-    position, normal, face, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)
-    toward = camera.toward(position)
-    return dot(normal, toward) < 0 if face is None else (dot(face, toward) < 0) != (dot(face, normal) < 0)
+    normal, toward = stopped(gbuffer["normal"]), camera.toward(stopped(gbuffer["position"]))
+    if "face_normal" not in gbuffer:
+        return dot(normal, toward) < 0
+    face = stopped(gbuffer["face_normal"])
+    return (dot(face, toward) < 0) != (dot(face, normal) < 0)
 
 
 def positive(x: Array) -> Array:

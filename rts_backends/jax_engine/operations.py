@@ -186,7 +186,7 @@ class _Differentiable:
         if self.operation.packed_result:
             out = out[:used]
             clear(results[0][used:])
-        kept = self.operation.forward_on_host(operands, out, params)
+        _, kept = self.operation.value_on_host(operands, params, out)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
 

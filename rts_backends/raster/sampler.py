@@ -105,7 +105,7 @@ def _drawn(
         order, (blocks, used) = mesh.order, mesh.seen(matrix, size, keep)
     else:
         order = ALL_IN_ORDER
-        blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (faces, vertices))
+        blocks, used = [np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (faces, vertices)]
     step = (max(size) / 2 + 2) / float(LIMIT)
     to_steps = np.diag([1 / step, 1 / step, 1, 1])
     to_steps[:2, 3] = -width / 2 / step, -height / 2 / step

@@ -15,8 +15,6 @@ from torch.utils import _pytree
 from rts import Engine, InputError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import quoted
-from rts.plugin_api.operations import Operation
-from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import array_api, operations, torch_internals
 from rts_backends.torch_engine.functions import quiet_forward_mode, tangent_alike, transformed
 from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
@@ -70,7 +68,9 @@ class TorchEngine(Engine):
         if array.dtype != dtype and array.dtype.kind == "f":
             # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
-                array = array.astype(dtype)
+                array = array.astype(dtype, "C")
+            if like is None or like.is_cpu:
+                return torch.from_numpy(array)
         device = _CPU if like is None else like.device
         if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)
@@ -88,12 +88,7 @@ class TorchEngine(Engine):
         """See `Engine.arange`: made on the device."""
         return torch.arange(count, dtype=like.dtype, device=like.device)
 
-    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
-        """Call `fn` on NumPy views or copies of `args`, without derivative.
-
-        Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
-        """
-        return call_host(fn, specs, *args)
+    call_host = staticmethod(call_host)  # pyright: ignore[reportAssignmentType]  # To pyright it is no method.
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
@@ -103,12 +98,7 @@ class TorchEngine(Engine):
         """`x` detached."""
         return x.detach()
 
-    def apply(self, operation: Operation, operands: Sequence[torch.Tensor], params: Mapping[str, Any]) -> torch.Tensor:
-        """The operation's result: by compiled code if tensors are on the host, with all floats float32 or all float64.
-
-        Otherwise, and under `torch.compile`, by its specification, which is array code.
-        """
-        return operations.apply(operation, operands, params)
+    apply = staticmethod(operations.apply)  # pyright: ignore[reportAssignmentType]  # To pyright it is no method.
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
         """True if all tensors are in the memory of the host."""

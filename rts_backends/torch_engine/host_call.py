@@ -107,11 +107,14 @@ def _alike(values: Sequence[torch.Tensor]) -> list[torch.Tensor]:
 
 
 def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
-    """The results of a host function, as tensors without derivative; see `Engine.call_host`."""
+    """The results of a host function, as tensors without derivative; see `Engine.call_host`.
+
+    Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
+    """
     if torch.compiler.is_compiling():
         # torch annotates nothing of what `disable` returns.
         return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
-    if transformed() or foreign(*(a for a in args if isinstance(a, torch.Tensor))):
+    if transformed() or foreign(*[a for a in args if isinstance(a, torch.Tensor)]):
         return _HostCall.apply(fn, specs, *args)
     with torch.no_grad():
         return _HostCall.forward(fn, specs, *args)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,24 +18,34 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, differentiated, foreign, is_zero
-from rts_backends.torch_engine.torch_internals import is_asked_for
+from rts_backends.torch_engine.functions import along, foreign, is_zero
+from rts_backends.torch_engine.torch_internals import differentiated, is_asked_for, is_legacy_batchedtensor
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
+_REQUIRES_GRAD = attrgetter("requires_grad")
 _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}
 
 
 def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str, Any]) -> Tensor:
     """The result of an operation: by compiled code if it takes the operands, else by the operation's array code.
 
-    The array code also runs under `torch.compile`, and while other array code is differentiated.
+    It takes floats that are all float32 or all float64, and integers, on the host. The array code also runs under
+    `torch.compile`, and while other array code is differentiated.
     """
-    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
+    real = operands[0].dtype
+    compiled = real in _DTYPES and not _specifying.on and not torch.compiler.is_compiling()
+    for x in operands:
+        compiled = compiled and x.is_cpu and (x.dtype == real or x.dtype in _INTEGERS)
+    if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    operands = [x.contiguous() for x in operands]
-    return (_Value if differentiated() else _Eager).apply(_Call(operation, params), *operands)
+    operands, count = tuple(map(Tensor.contiguous, operands)), operation.differentiable
+    if differentiated():
+        return _Value.apply(_Call(operation, params), *operands)
+    if not (torch.is_grad_enabled() and any(map(_REQUIRES_GRAD, operands[:count]))):
+        return torch.from_numpy(operation.value_on_host(_host(operands), params)[0])
+    return _Eager.apply((_Call(operation, params), operands[count:]), *operands[:count])
 
 
 class _Specifying(threading.local):
@@ -47,20 +58,6 @@ class _Specifying(threading.local):
 
 
 _specifying = _Specifying()
-
-
-def _fits(operands: Sequence[Tensor]) -> bool:
-    """True if compiled code takes these operands: floats all float32 or all float64, the rest integers.
-
-    All are on the host.
-    """
-    real = operands[0].dtype
-    if real not in _DTYPES:
-        return False
-    for x in operands:
-        if not x.is_cpu or (x.dtype != real and x.dtype not in _INTEGERS):
-            return False
-    return True
 
 
 class _Call:
@@ -170,17 +167,17 @@ class _Derivatives(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        call, operands = ctx.call, ctx.saved_tensors
+        call, operands, (g,) = ctx.call, ctx.saved_tensors, gradients
         wanted = ctx.needs_input_grad[1 : 1 + call.count]
-        if foreign(*gradients):
+        if is_legacy_batchedtensor(g):
             varied, fixed = call.split(operands)
-            found = call.pulled(wanted, fixed)(*varied, gradients[0])
+            found = call.pulled(wanted, fixed)(*varied, g)
         elif torch.is_grad_enabled() or differentiated():
-            found = _Pull.apply(call, wanted, *operands, gradients[0])
+            found = _Pull.apply(call, wanted, *operands, g)
         else:
-            found = _Pull.forward(call, wanted, *operands, gradients[0])
-        found = (x if wish else None for x, wish in zip(found, wanted, strict=True))
-        return None, *found, *[None] * (len(operands) - call.count)
+            found = _Pull.forward(call, wanted, *operands, g)
+        found = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        return None, *found, *[None] * (len(ctx.needs_input_grad) - 1 - call.count)
 
     @staticmethod
     def jvp(ctx, *input_tangents):
@@ -197,13 +194,16 @@ class _Derivatives(torch.autograd.Function):
 
 
 class _Eager(_Derivatives):
-    """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python."""
+    """The value of an operation, by compiled code, outside of transforms: in half as many calls of Python.
+
+    Operands without derivatives come along with the call, since torch takes time for each argument.
+    """
 
     @staticmethod
-    def forward(ctx, call, *operands):
-        ctx.call = call
+    def forward(ctx, call_and_fixed, *varied):
+        call, fixed = call_and_fixed
+        ctx.call, operands = call, (*varied, *fixed)
         ctx.save_for_backward(*operands)
-        ctx.save_for_forward(*operands)
         out, call.kept = call.operation.value_on_host(_host(operands), call.params)
         return torch.from_numpy(out)
 
@@ -234,11 +234,12 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(call, wanted, *arrays):
-        operands, (g,) = _host(arrays[:-1]), _host(arrays[-1:])
-        found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
-        results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        (*operands, g), found, results = _host(arrays), [], []
+        for x, wish in zip(operands, wanted, strict=False):
+            found.append(np.zeros(x.shape if wish else 0, x.dtype))
+            results.append(found[-1] if wish else None)
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
-        return tuple(torch.from_numpy(x) for x in found)
+        return tuple(map(torch.from_numpy, found))
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -15,6 +15,7 @@ each value read takes longer.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -95,6 +96,10 @@ def is_asked_for(ctx: Any, k: int) -> bool:
         return True
 
 
-def forward_level() -> int:
-    """The level of forward mode, negative where it is off; 0 from a torch that does not tell."""
-    return getattr(forward_ad, "_current_level", 0)
+forward_level = partial(getattr, forward_ad, "_current_level", 0)
+"""() → the level of forward mode, negative where it is off; 0 from a torch that does not tell."""
+
+
+def differentiated() -> bool:
+    """True under a `torch.func` transform, or in forward mode."""
+    return current_level() is not None or forward_level() >= 0
