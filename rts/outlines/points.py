@@ -175,7 +175,8 @@ class Points:
         known, count = None not in every, len(layers.part)
         sheets = list({id(sheet): sheet for sheet in every}.values())
         if known:
-            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width, seams)
+            lit = layers if count == 1 else _lit(layers, opaque)
+            breaks, stacks = breaks_of_stacks(lit, opaque, sheets, self._width, seams)
         else:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle, self._hints(layers))

@@ -143,8 +143,7 @@ def _moving_edges(
     from rts.outlines import silhouettes_loops
 
     slope, depth, tangent = np.zeros((len(near), 2, 2)), np.full(len(near), np.nan), np.zeros((len(near), 2))
-    known = read_only(parts), read_only(triangles), read_only(points)
     for sheet in sheets:
-        sheet.edges(near, *known, slope, depth, tangent)
+        sheet.edges(near, parts, triangles, points, slope, depth, tangent)
     silhouettes_loops.settle(width, depth, near, slope, tangent)
     return slope, tangent, cells_away(depth, width)

@@ -78,13 +78,12 @@ def _link(begin, stop, spans, of):
         j = low
         while searches and j < stop:
             searches = spans[j, 0] <= end + TOUCH
-            if searches and j != i and spans[j, 0] >= end - TOUCH and spans[j, 1] > end:
-                if of[j, PART] == of[i, PART] and of[j, BEFORE] < 0:
-                    z = depth_at(spans, i, end)
-                    if abs(depth_at(spans, j, end) - z) <= ALIKE * abs(z):
-                        searches = False
-                        if not _turns(i, j, spans, of):
-                            of[i, AFTER], of[j, BEFORE] = j, i
+            near = searches and j != i and spans[j, 0] >= end - TOUCH and spans[j, 1] > end
+            if near and of[j, PART] == of[i, PART] and of[j, BEFORE] < 0:
+                z = depth_at(spans, i, end)
+                searches = abs(depth_at(spans, j, end) - z) > ALIKE * abs(z)
+                if not searches and not _turns(i, j, spans, of):
+                    of[i, AFTER], of[j, BEFORE] = j, i
             j += 1
 
 
