@@ -117,9 +117,10 @@ def _spans_on(
     names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
     parallel(spans_loops.by_start, len(gaps.gap), begins, spans[:, 0].copy(), order, work=50 * len(order))
-    of, parts = np.empty((max(len(order), 1), 6), np.int32), parts.take(order)
+    of, parts = np.full((max(len(order), 1), 6), -1, np.int32), parts.take(order)
     of[: len(order), 0], of[: len(order), 1:3], of[: len(order), 3] = parts, names.take(order, 0)[:, 1:], opaque[parts]
-    return begins, spans.take(order, 0), of
+    # Loops read the first span in place of none.
+    return begins, spans.take(order, 0) if len(order) else np.ones((1, spans.shape[1])), of
 
 
 def _moving_edges(

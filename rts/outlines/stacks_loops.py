@@ -452,12 +452,14 @@ def _of_front(base, f, found, inner, spans, of, ends, whole, place_of, samples, 
     for side in range(2):
         i, beside = sides[e, side, 0], place_of[min(max(e + 2 * side - 1, base), base + found - 1)]
         beside = beside if 0 <= f + 2 * side - 1 < found else 1.0 * side
-        last, inward, j = _aside(max(i, 0), side, place, beside, inner, spans, of)
+        last, inward, j = place, place, i
+        if i >= 0:
+            last, inward, j = _aside(i, side, place, beside, inner, spans, of)
         part = _named(i, PART, of, ends)
         samples[e, side, 0], samples[e, 2 + side, 0], whole[e, 2 + side] = part, part, part
         samples[e, side, 1] = _named(i, TRIANGLE, of, ends)
-        samples[e, 2 + side, 1] = _named(j if i >= 0 else i, TRIANGLE, of, ends)
-        places[e, side], places[e, 2 + side] = last if i >= 0 else place, inward if i >= 0 else place
+        samples[e, 2 + side, 1] = _named(j, TRIANGLE, of, ends)
+        places[e, side], places[e, 2 + side] = last, inward
         sides[e, side, 0] = side if part >= 0 else -1
 
 
