@@ -12,14 +12,14 @@ from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
-from rts.sampling.scene import Scene, has_sheets
+from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 
-def is_known(scene: Scene) -> bool:
+def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
-    for x in collected((scene.read, [part.transform for part in scene.parts], scene.camera)):
+    for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
         if type(x) is not np.ndarray:
             shape, value = _probed(x)
             if value is None or value.ndim != len(shape):

@@ -29,7 +29,7 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     Only entries are added for engines that pad; nothing where values are traced, or several at once, or where a sampler
     has a way of its own.
     """
-    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene):
+    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
         return scene, grid
     here, cells = from_values(scene, grid.size, values_of(scene, grid))
     like = scene.context.like
