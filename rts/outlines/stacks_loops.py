@@ -272,14 +272,6 @@ def _at_centre(stack, count, k, spans, of, ends, depths):
 
 
 @compiled(inline="always")
-def _gives_way(i, j, spans):
-    """True if span i ends at the second centre, or span j, which the sample there shows, comes up from behind it."""
-    start = max(spans[i, 0], spans[j, 0], 0.0)
-    z = depth_at(spans, i, start)
-    return (spans[i, 1] <= 1 + CLOSE) | (depth_at(spans, j, start) - z > MARGIN * abs(z))
-
-
-@compiled(inline="always")
 def _record(e, kind, place, shown, whole, place_of, sides):
     """Fill in change e of a stack, whose spans are `shown` (2, K) as far as they are seen; returns 1 if any is."""
     changed = 0
@@ -370,7 +362,7 @@ def _along(first, last, gap, begins, live, heads, spans, of, seen, triangle, dep
                 _show(stack, count, 1, shown, of)
                 e += _record(e if e < room[last] else spare, kind, place, shown, whole, place_of, sides)
         m = _at_centre(stack, count, 1, spans, of, ends, depths)
-        if most == 1 and ends[2, PART] >= 0 and (m < 0 or (m > 0 and _gives_way(stack[0], stack[m], spans))):
+        if most == 1 and ends[2, PART] >= 0 and (m < 0 or (m > 0 and spans[stack[0], 1] <= 1 + CLOSE)):
             _show(stack, count, 0, shown, of)
             shown[1, 0] = SECOND if m < 0 else stack[m]
             e += _record(e if e < room[last] else spare, 2, 1.0, shown, whole, place_of, sides)
