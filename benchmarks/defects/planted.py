@@ -124,16 +124,16 @@ LOOPS = [
     ),
     Defect(
         "the farther of two surfaces ends at a break",
-        "rts/outlines/stacks_loops.py",
-        "kind = 0 if z < deep else 1\n",
-        "kind = 1 if z < deep else 0\n",
+        "rts/outlines/fronts_loops.py",
+        "(0 if z < deep else 1)\n",
+        "(1 if z < deep else 0)\n",
         "edges edges_bodies",
     ),
     Defect(
         "surfaces cross at the mirrored place",
-        "rts/outlines/stacks_loops.py",
-        "low + (high - low) * before / (before - after)",
-        "low + (high - low) * after / (after - before)",
+        "rts/outlines/fronts_loops.py",
+        "at = low + (high - low) * before / (before - after)",
+        "at = low + (high - low) * after / (after - before)",
         "edges edges_bodies",
     ),
     Defect(
@@ -167,15 +167,15 @@ LOOPS = [
     Defect(
         "what ends is on the wrong side of a stack",
         "rts/outlines/stacks_loops.py",
-        "samples[e, at, 0], sides[e, side, k], n = i, at - 2, max(n, at + 1)",
-        "samples[e, at, 0], sides[e, 1 - side, k], n = i, at - 2, max(n, at + 1)",
+        "if kind == 1 - side and (m == at or m == partner):",
+        "if kind == side and (m == at or m == partner):",
         "edges_glass",
     ),
     Defect(
         "layers that cross keep their order",
         "rts/outlines/stacks_loops.py",
-        "stack[m], stack[m + 1], other = stack[m + 1], stack[m], -1",
-        "stack[m], stack[m + 1], other = stack[m], stack[m + 1], -1",
+        "stack[m], stack[m + 1] = stack[m + 1], stack[m]",
+        "stack[m], stack[m + 1] = stack[m], stack[m + 1]",
         "edges_glass",
     ),
     Defect(

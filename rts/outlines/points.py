@@ -19,6 +19,7 @@ from rts.outlines.found import Outlines, Told
 from rts.outlines.gaps import SEAM, Breaks, Fronts, Gaps, Hints, Oracle, find_breaks
 from rts.outlines.segments import joined
 from rts.outlines.sheets import Sheets
+from rts.outlines.spans import breaks_of_triangles
 from rts.outlines.stacks import breaks_of_stacks
 from rts.plugin_base import overrides
 from rts.registry import name_of
@@ -174,9 +175,11 @@ class Points:
         every, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
         known, count = None not in every, len(layers.part)
         sheets = list({id(sheet): sheet for sheet in every}.values())
-        if known:
-            lit = layers if count == 1 else _lit(layers, opaque)
-            breaks, stacks = breaks_of_stacks(lit, opaque, sheets, self._width, seams)
+        if count == 1 and known:
+            breaks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width, seams)
+            stacks = None
+        elif known:
+            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width, seams)
         else:
             oracle = Oracle(functools.partial(self._layers, count=count), self._width)
             breaks, stacks = find_breaks(_lit(layers, opaque), oracle, self._hints(layers))

@@ -18,9 +18,6 @@ TINY = 1e-9
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
 
-FEW = 64
-"""Number of spans of a gap up to which they are sorted by insertion, which is faster for few."""
-
 SLACK = np.float32(0.01)
 """By how much boxes of triangles are larger than these, against rounding, in cells."""
 
@@ -352,12 +349,5 @@ def by_gap(gaps, count):
 def by_start(first, last, begins, starts, order):
     """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start."""
     for g in range(first, last):
-        begin, stop = begins[g], begins[g + 1]
-        if stop - begin > FEW:
-            order[begin:stop] = order[begin:stop][np.argsort(starts[order[begin:stop]], kind="mergesort")]
-        for n in range(begin + 1, stop if stop - begin <= FEW else begin):
-            own, at = order[n], n
-            while at > begin and starts[order[at - 1]] > starts[own]:
-                order[at] = order[at - 1]
-                at -= 1
-            order[at] = own
+        own = order[begins[g] : begins[g + 1]]
+        own[:] = own[np.argsort(starts[own], kind="mergesort")]

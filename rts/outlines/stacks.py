@@ -1,22 +1,19 @@
-"""Breaks between stacks of layers, exactly: what the triangles that cross a gap hide of one another there.
+"""Breaks between stacks of layers that let light through: where a layer that is seen ends, or two cross.
 
-The layers at two neighbouring centres are one surface if a sheet of triangles leads from one to the other. Where they
-are not, and where a silhouette passes between the centres, all triangles on the line between them are found, and their
-stack at each place. A silhouette is an edge where a sheet of triangles ends or turns away; so things that no centre
-sees are found as well. Each change of what is seen is a break, which moves with the one layer that ends there, or with
-the two that cross. Of opaque surfaces there is one layer.
+As `rts.outlines.spans`, of all layers that are seen in place of the fronts alone. Each change of the stack along a gap
+is a break of its own, which moves with the one layer that ends there, or with the two that cross.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rts.compiling.threads import parallel, read_only
-from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks, cells_away
+from rts.compiling.threads import parallel
+from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks
 from rts.outlines.sheets import Sheets
+from rts.outlines.spans import moving_edges, spans_on
 
 ROOM = 2
 """Changes for each span that there is room for at first: it starts and ends. Where many cross, there is too little."""
@@ -24,127 +21,83 @@ ROOM = 2
 
 def breaks_of_stacks(
     layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray, seams: bool
-) -> tuple[Breaks, Stacks | None]:
-    """The breaks between the stacks at the centres of all cells, and the layers there; None of a single layer.
+) -> tuple[Breaks, Stacks]:
+    """The breaks between the stacks at the centres of all cells, and the layers there.
 
     Args:
         layers: what is seen at centres, arrays (K, H, W), front to back; nothing behind an opaque layer.
         opaque: (P,) bool, the parts that let no light through.
         sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-        seams: whether there are breaks where a surface goes on across edges that its triangles do not share, and they
-            are large, or turn there: colours may change. Of several layers there are two breaks in one place.
+        seams: as of `breaks_of_triangles`; at each there are two breaks in one place.
     """
-    marks, joined = _gaps_to_search(layers, opaque, sheets, width)
-    gap, place, near, ends, parts, owners, triangles, points, sides = _changes(
-        Gaps.of(marks), layers, opaque, sheets, seams
-    )
-    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False  # Elsewhere one surface goes on from centre to centre.
-    slope, tangent, away = _moving_edges(near, parts, triangles, place, sheets, width)
-    of_breaks, of_edges = (points[:, :2], points[:, 2:4], parts, joined), (tangent, away)
-    breaks = Breaks(gap, place, near, slope, ends, *of_breaks, np.ascontiguousarray(triangles[:, :4]), *of_edges)
-    if len(layers.part) == 1:
-        return breaks, None
-    last, stack = owners[:, :2], (owners[:, 2:], triangles[:, 2:], points[:, 2:])
-    return breaks, Stacks(last, *stack, sides, np.zeros(owners.shape, np.int32))
+    gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
+    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets, seams)
+    gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
+    joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
+    inside, part = layers.part[0] >= 0, layers.part
+    joined[0, :, :-1] = inside[:, 1:] & (part[:, :, 1:] == part[:, :, :-1]).all(0)
+    joined[1, :-1] = inside[1:] & (part[:, 1:] == part[:, :-1]).all(0)
+    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
+    along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
+    at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
+    slope, tangent, away = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
+    last, stack = samples[:, :2], samples[:, 2:]
+    triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
+    ends, last_points = whole[:, 4:] == 1, points[:, :2]
+    samples_of = last_points, last_points, whole[:, 2:4], joined, triangles
+    breaks = Breaks(gap, at, near, slope, ends, *samples_of, tangent, away)
+    numbers = np.zeros(samples.shape[:2], np.int32)
+    return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides, numbers)
 
 
-def _gaps_to_search(
-    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer.
-
-    And of those whose centres see the same parts.
-    """
+def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
+    """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
     from rts.outlines import spans_loops
 
-    part, size = layers.part, layers.part.shape[1:]
-    fronts = [Fronts(*(np.ascontiguousarray(x[k]) for x in layers)) for k in range(len(part))]
-    ends = fronts[0]
-    if len(fronts) > 1:
-        ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
-    for front in fronts if len(fronts) > 1 and opaque.any() else ():
-        solid = (front.part >= 0) & opaque[front.part]
-        ends.part[solid], ends.depth[solid] = front.part[solid], front.depth[solid]
-    met, marks, alike = np.zeros((2, *size), np.uint8), [], []
+    size = layers.part.shape[1:]
+    ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
+    for part, _, depth in zip(*layers, strict=True) if opaque.any() else ():
+        solid = (part >= 0) & opaque[part]
+        ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
+    met, marks = np.zeros((2, *size), np.uint8), False
     for sheet in sheets:
         sheet.meet(ends, width, met)
-    for front in fronts:
-        if marks and not (front.part >= 0).any():
+    for layer in range(len(layers.part)):
+        front = Fronts(*(np.ascontiguousarray(x[layer]) for x in layers))
+        if layer and not (front.part >= 0).any():
             break
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
         for sheet in sheets:
             sheet.join(front, met, joined)
         parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=front.part.size // 2)
-        marks.append(wanted)
-        alike.append(joined)
-    joined = alike[0]
-    if len(fronts) > 1:
-        joined[0, :, :-1] &= (part[:, :, 1:] == part[:, :, :-1]).all(0)
-        joined[1, :-1] &= (part[:, 1:] == part[:, :-1]).all(0)
-    return marks[0] if len(marks) == 1 else np.logical_or.reduce(marks), joined
+        marks = marks | wanted
+    return np.asarray(marks)
 
 
-def _changes(gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], seams: bool) -> tuple[Any, ...]:
-    """The changes of stacks along gaps; see `stacks_loops.listed`."""
+def _changes(
+    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], seams: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The changes of stacks along gaps; see `stacks_loops.changes`."""
     from rts.outlines import stacks_loops as loops
 
-    count, most = len(gaps.gap), len(layers.part)
-    begins, spans, of = _spans_on(gaps, sheets, opaque, seams)
-    rows, counts, live = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count, np.int32)
-    known = gaps.gap, begins, spans, of, np.empty(len(spans), np.int32), live, opaque, *map(read_only, layers)
+    gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
+    begins, names, spans, parts = spans_on(gaps, sheets, seams)
+    seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
+    for k in (0, 1):
+        y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
+        seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
+    rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
     room = ROOM * (begins + 2 * np.arange(count + 1))
     while True:
-        total = int(room[-1]) + 1
-        numbers = np.empty(total), np.empty((total, most + 3, 2), np.int32), np.empty((total, most + 3))
+        total = int(room[-1])
+        numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        parallel(loops.changes, count, *known, room, rows, counts, INNER, *found, work=600 * count)
+        known = begins, spans, names, parts, opaque, seen, depth, room, rows, counts
+        parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
-            return loops.listed(rows, counts, gaps.gap, *found)
-        room = np.append(0, np.cumsum(np.maximum(counts, np.diff(room))))  # Many surfaces pass through one another.
-
-
-def _spans_on(
-    gaps: Gaps, sheets: Sequence[Sheets], opaque: np.ndarray, seams: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spans of all parts on gaps, gap after gap: where those of each begin (M + 1,), their numbers, and integers.
-
-    See `Sheets.spans` and `stacks_loops.changes`.
-    """
-    from rts.outlines import spans_loops
-
-    several = [sheet.spans(gaps, seams) for sheet in sheets]
-    names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
-    begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
-    parallel(spans_loops.by_start, len(gaps.gap), begins, spans[:, 0].copy(), order, work=50 * len(order))
-    of, parts = np.full((max(len(order), 1), 6), -1, np.int32), parts.take(order)
-    of[: len(order), 0], of[: len(order), 1:3], of[: len(order), 3] = parts, names.take(order, 0)[:, 1:], opaque[parts]
-    # Loops read the first span in place of none.
-    return begins, spans.take(order, 0) if len(order) else np.ones((1, spans.shape[1])), of
-
-
-def _moving_edges(
-    near: np.ndarray,
-    parts: np.ndarray,
-    triangles: np.ndarray,
-    points: np.ndarray,
-    sheets: Sequence[Sheets],
-    width: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`Breaks.slope`, `tangent` and `cells_away`: of the edge of the triangle that ends, or where two planes cross.
-
-    Args:
-        near: `Breaks.near`. It becomes 0 where surfaces that cross hardly differ in slope.
-        parts: (B, 2) int32, before and behind.
-        triangles: (B, 2 or more) int32, alike.
-        points: (B, 2), where breaks are.
-        sheets: the triangles of all parts.
-        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-    """
-    from rts.outlines import silhouettes_loops
-
-    slope, depth, tangent = np.zeros((len(near), 2, 2)), np.full(len(near), np.nan), np.zeros((len(near), 2))
-    for sheet in sheets:
-        sheet.edges(near, parts, triangles, points, slope, depth, tangent)
-    silhouettes_loops.settle(width, depth, near, slope, tangent)
-    return slope, tangent, cells_away(depth, width)
+            break
+        room = np.append(0, np.cumsum(counts))  # Many surfaces pass through one another.
+    at = np.repeat(rows - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    whole, place, samples, places, sides = (x.take(at, 0) for x in found)
+    return whole, place, samples, places, sides
