@@ -443,9 +443,9 @@ class ImageResiduals(Residuals):
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
-        context, apron = context_of(vector), band.sampled.apron
+        context, cells = context_of(vector), {"border": band.sampled.apron, "supersample": band.sampled.supersample}
         sampled = owned(band.sampled, band.sampled.row, context)
-        known = constants(splats_of(sampled, band.parts, positions, rgba, context, border=apron), engine, vector)
+        known = constants(splats_of(sampled, band.parts, positions, rgba, context, **cells), engine, vector)
         loss = self.loss if self.loss.robust else None
         tangents = t_positions, t_rgba if colored else None
         return splatter.normal_equations(known, *tangents, target, weights, background, loss)
