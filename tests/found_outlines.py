@@ -2,7 +2,6 @@
 
 import contextlib
 
-import numpy as np
 import pytest
 
 import rts
@@ -14,9 +13,9 @@ def noted():
     """A list of pairs, filled meanwhile: outlines with `rows` counted over all parts, and the samples (K, H, W)."""
     found, whole = [], Outlines.stencil
 
-    def stencil(self, starts, row, told, real):
-        found.append((self._replace(rows=np.where(self.rows >= 0, self.rows + starts[self.parts], -1)), row))
-        return whole(self, starts, row, told, real)
+    def stencil(self, row, told, real):
+        found.append((self, row))
+        return whole(self, row, told, real)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Outlines, "stencil", stencil)

@@ -10,6 +10,8 @@ import numpy as np
 
 from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
+from rts.outlines.gaps import Breaks
+from rts.outlines.segments import joined
 from rts.sampling.entries import is_still
 from rts.sampling.scene import Scene
 
@@ -26,10 +28,8 @@ class Outlines(NamedTuple):
             tell colours (−1 if only one of both is told, see `Told`), since in the last hair before an outline normals
             may turn away, and colours with them; and a pair on the ray of the last sample of the surface that ends,
             beside its deepest point, whose mean moves as the outline (`RaySurface.deepest`): a single sample does not
-            tell how a kink of a field moves. They are counted in their part; −1 for none. Of K layers
-            (B, 2 + K + 1): the two last samples, only where the layer that ends is, or two where layers cross; and
-            those of the stack there.
-        parts: of the shape of `rows`, int32, their parts, or −1.
+            tell how a kink of a field moves. −1 stands for none. Of K layers (B, 2 + K + 1): the two last samples,
+            only where the layer that ends is, or two where layers cross; and those of the stack there.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
         place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
@@ -55,7 +55,6 @@ class Outlines(NamedTuple):
     """
 
     rows: np.ndarray
-    parts: np.ndarray
     sides: np.ndarray
     place: np.ndarray
     gap: np.ndarray
@@ -72,18 +71,30 @@ class Outlines(NamedTuple):
     joined: np.ndarray
     left: int
 
-    def stencil(self, starts: np.ndarray, row: np.ndarray, told: Told, real: Any) -> Stencil:
-        """The areas and fluxes beside outlines.
+    @classmethod
+    def of(cls, breaks: Breaks, rows: np.ndarray, sides: np.ndarray | None = None, left: int = 0) -> Outlines:
+        """Outlines of breaks whose samples are `rows`; `sides` are there if light passes through, see `joined`."""
+        from rts.outlines import segments_loops
+
+        count = len(rows)
+        place, near = np.empty(count), np.empty(count, np.int32)
+        segments_loops.places(breaks.gap, breaks.place, breaks.near, place, near)
+        layered = sides is not None
+        sides = np.empty((count, 2, 0), np.int32) if sides is None else sides
+        of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
+        return cls(rows, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
+
+    def stencil(self, row: np.ndarray, told: Told, real: Any) -> Stencil:
+        """The areas and fluxes beside outlines, whose `rows` are counted over all parts.
 
         Args:
-            starts: (P,) int32, for each part the index, over all parts, of the first of its samples beside breaks.
             row: (K, H, W) int32, the samples in cells, counted likewise.
             told: what samples tell.
             real: the dtype of weights.
         """
         from rts.outlines import stencil_loops as loops
 
-        rows = np.where(self.rows >= 0, self.rows + starts[self.parts], np.int32(-1))
+        rows = self.rows
         last, none = rows[:, :2], np.full((len(rows), 2), -1, np.int32)
         if self.sides.shape[2]:
             stack = np.take_along_axis(rows[:, None, 2:], np.maximum(self.sides, 0), axis=2)
@@ -113,12 +124,6 @@ class Outlines(NamedTuple):
         before = np.where(self.ends[:, 0], first, np.roll(last[:, 1], 1))
         colors = np.stack([before, np.where(self.ends[:, 1], second, last[:, 1])], axis=1)
         return (last, colors) if told.motions else (colors, inner)
-
-    def beside(self, count: int) -> np.ndarray:
-        """The number (P,) int32 of rows up to the last one that is named, of each of `count` parts."""
-        ends = np.zeros(count + 1, np.int32)  # The last one is that of no part.
-        np.maximum.at(ends, self.parts.reshape(-1), self.rows.reshape(-1) + np.int32(1))
-        return ends[:count]
 
 
 COLORS, MOTIONS = 16, 32

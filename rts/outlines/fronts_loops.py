@@ -318,7 +318,7 @@ def breaks(
 
 
 @loop
-def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, triangles, ends):
+def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, triangles, ends, joined):
     """Fill in the fields of `Breaks`, gap after gap, from what `breaks` found with room to spare.
 
     Args:
@@ -333,10 +333,12 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, trian
         near: (B,) int32 to fill.
         triangles: (B, 4) int32 to fill; −1 where nothing is seen.
         ends: (B, 2) bool to fill.
+        joined: (2, H, W) bool, False from then on in gaps with a break: elsewhere one surface goes on.
     """
     b = 0
     for g in range(len(rows)):
         y, x, row = gap_of[g, 0], gap_of[g, 1], gap_of[g, 2]
+        joined[1 - row, y, x] &= counts[g] == 0
         for n in range(rows[g], rows[g] + counts[g]):
             gap[b, 0], gap[b, 1], gap[b, 2], near[b] = y, x, row, whole[n, 1]
             for i in range(5):

@@ -16,7 +16,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Told, arrays_of, fits, specs
+from rts.outlines.found import Outlines, Told, arrays_of, fits, specs
 from rts.outlines.points import Points, at_centres, has_pairs
 from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
@@ -68,10 +68,10 @@ def with_outlines(
     cells = map_leaves(host_value, sampled.cells)
     centres = at_centres(cells, sampled.samples)
     while True:
-        found, more = points.outlines(centres, count)
-        samples, places = _joined(sampled.samples, more, found.beside(len(more)))
+        found, parts, more = points.outlines(centres, count)
+        samples, places = _joined(sampled.samples, more, _used(found.rows, parts, len(more)))
         row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
-        stencil = found.stencil(places.beside, row, told, real)
+        stencil = _over_parts(found, parts, places.beside).stencil(row, told, real)
         if fits(stencil, most) or not count:
             break
         count = min(count, len(found.place)) // 2
@@ -105,6 +105,18 @@ class _Places(NamedTuple):
         shifts = self.centres - np.cumsum(self.counts) + self.counts
         at = np.arange(self.counts.sum()) + np.repeat(shifts, self.counts)
         return np.append(at, -1).astype(np.int32)
+
+
+def _over_parts(found: Outlines, parts: np.ndarray, starts: np.ndarray) -> Outlines:
+    """Outlines with rows counted over all parts, those of each of which begin at `starts` (P,)."""
+    return found._replace(rows=np.where(found.rows >= 0, found.rows + starts[parts], np.int32(-1)))
+
+
+def _used(rows: np.ndarray, parts: np.ndarray, count: int) -> np.ndarray:
+    """The number (P,) int32 of rows up to the last one that is named, of each of `count` parts."""
+    ends = np.zeros(count + 1, np.int32)  # The last one is that of no part.
+    np.maximum.at(ends, parts.reshape(-1), rows.reshape(-1) + np.int32(1))
+    return ends[:count]
 
 
 def _joined(centres: Sequence[Samples], beside: Sequence[Samples], used: Any) -> tuple[tuple[Samples, ...], _Places]:
@@ -172,12 +184,12 @@ def _found_on_host(
         points = Points.of(here, Grid(camera, grid.size), [x for *_, x in of_parts], told)
         centres, count = at_centres(cells, sampled.samples), most
         while True:
-            found, more = points.outlines(centres, count)
-            stencil = found.stencil(beside, cells.row, told, real)
+            found, of_rows, more = points.outlines(centres, count)
+            stencil = _over_parts(found, of_rows, beside).stencil(cells.row, told, real)
             if not count or (fits(stencil, most) and all(own.holds(x) for own, x in zip(room, more, strict=True))):
                 break
             count = min(count, len(found.place)) // 2
-        results = [*arrays_of(stencil), found.beside(parts), found.left]
+        results = [*arrays_of(stencil), _used(found.rows, of_rows, parts), found.left]
         for part, samples, tables in zip(here.parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = (

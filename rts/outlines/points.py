@@ -16,8 +16,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import SEAM, Breaks, Fronts, Gaps, Hints, Oracle, find_breaks
-from rts.outlines.segments import joined
+from rts.outlines.gaps import Breaks, Fronts, Gaps, Hints, Oracle, find_breaks
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import breaks_of_triangles
 from rts.outlines.stacks import breaks_of_stacks
@@ -92,8 +91,11 @@ class Points:
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts, told)
 
-    def outlines(self, layers: Fronts, most: int | None = None) -> tuple[Outlines, list[Samples]]:
-        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; and their samples, by part."""
+    def outlines(self, layers: Fronts, most: int | None = None) -> tuple[Outlines, np.ndarray, list[Samples]]:
+        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; and their samples, by part.
+
+        `Outlines.rows` are counted in each part; in the middle there are these parts, int32, of the same shape, or −1.
+        """
         broken = self._broken(layers, most)
         rows, samples = np.full(broken.parts.shape, -1, np.int32), []
         joints = {joint.first: joint for joint in self._scene.joints}
@@ -111,20 +113,18 @@ class Points:
                 continue
             one, rows[inside] = self._of_layers(part, points, broken.numbers[inside], fragments)
             samples.append(one)
-        return self._found(broken, rows, samples), samples
+        return *self._found(broken, rows, samples), samples
 
-    def _found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Outlines:
+    def _found(
+        self, broken: _Broken, rows: np.ndarray, samples: list[Samples]
+    ) -> tuple[Outlines, np.ndarray]:
         """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
         breaks, parts, _, _, _, sides, left = broken
         layered = sides.shape[-1] > 0
         if not layered:
             pairs, of_pairs = self._pairs(breaks, samples)
             rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
-        down, across, along = breaks.gap.T
-        place = np.where(along == 1, breaks.place[:, 0] - across, breaks.place[:, 1] - down) - 0.5
-        near = np.where(breaks.near == SEAM, 0, breaks.near)  # There both surfaces move alike.
-        of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
-        return Outlines(rows, parts, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
+        return Outlines.of(breaks, rows, sides if layered else None, left), parts
 
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).

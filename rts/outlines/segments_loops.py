@@ -52,6 +52,14 @@ def on_sides(x, y, side):
 
 
 @loop
+def places(gap, at, near, place, kind):
+    """Fill in `Outlines.place` (B,) and `Outlines.near` (B,), from the fields of `Breaks`."""
+    for b in range(len(gap)):
+        place[b] = at[b, 0] - gap[b, 1] - 0.5 if gap[b, 2] == 1 else at[b, 1] - gap[b, 0] - 0.5
+        kind[b] = 0 if near[b] == SEAM else near[b]  # There both surfaces move alike.
+
+
+@loop
 def ends_of(gap, place, near, parts, height, width):
     """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
 

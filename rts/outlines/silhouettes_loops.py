@@ -225,7 +225,7 @@ def _nearest_edge(corners, sign, x, y):
 
 
 @loop
-def settle(width, depth, near, slope, tangent):
+def settle(width, depth, near, slope, tangent, away):
     """Make tangents (B, 2) unit directions, of crossings the lines where planes meet; those that are flat end before.
 
     Args:
@@ -234,8 +234,10 @@ def settle(width, depth, near, slope, tangent):
         near: (B,), see `edges`; becomes 0 where slopes of surfaces that cross hardly differ.
         slope: (B, 2, 2), see `edges`; becomes 0 but at crossings.
         tangent: (B, 2), see `edges`.
+        away: (B,) to fill with `Breaks.cells_away`.
     """
     for b in range(len(near)):
+        away[b] = np.log(width[0] + width[1] * depth[b]) / width[1] if width[1] > 0 else depth[b] / width[0]
         if near[b] == 2:
             x, y = slope[b, 1, 0] - slope[b, 0, 0], slope[b, 1, 1] - slope[b, 0, 1]
             if abs(x) + abs(y) > 1e-4 * (width[0] + width[1] * depth[b]):

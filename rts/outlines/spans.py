@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel, read_only
-from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, cells_away
+from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps
 from rts.outlines.sheets import Sheets
 
 
@@ -48,8 +48,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     count = counts.sum()
     gap, points, near = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
-    fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends)
-    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False  # Elsewhere one surface goes on from centre to centre.
+    fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends, joined)
     slope, tangent, away = moving_edges(near, beside, triangles, points[:, 0], sheets, width)
     place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]
     return Breaks(gap, place, near, slope, ends, last, inner, beside, joined, triangles, tangent, away)
@@ -95,5 +94,6 @@ def moving_edges(
     known = read_only(parts), read_only(triangles), read_only(points)
     for sheet in sheets:
         sheet.edges(near, *known, slope, depth, tangent)
-    silhouettes_loops.settle(width, depth, near, slope, tangent)
-    return slope, tangent, cells_away(depth, width)
+    away = np.empty(len(near))
+    silhouettes_loops.settle(width, depth, near, slope, tangent, away)
+    return slope, tangent, away

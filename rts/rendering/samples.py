@@ -8,11 +8,12 @@ from dataclasses import replace
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
+from rts.outlines.of_joint import sampled_fronts
 from rts.outlines.of_scene import with_outlines
 from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
-from rts.sampling.host_scenes import in_engine, on_the_host
+from rts.sampling.host_scenes import in_engine, on_the_host, real_of
 from rts.sampling.joint import with_joints
 from rts.sampling.layer_count import has_full_stacks, with_all_layers
 from rts.sampling.merging import sampled_parts, without_hidden
@@ -104,6 +105,12 @@ def sampled_scene(
         # Samples do not spread, so that what lies behind an opaque one has no effect.
         return without_hidden(sampled_parts(scene, grid, request, count, of_opaque=1), scene.opaque)
 
+    joint = scene.joints[0] if len(scene.joints) == 1 else None
+    if outlines and layers == 1 and capacity is None and joint is not None and len(joint.parts) == len(scene.parts):
+        sampled = sampled_fronts(joint, grid, told, same, real_of(scene))
+        if not settings.fronts:
+            sampled = replace(sampled, cells=replace(sampled.cells, triangle=None))
+        return in_engine(replace(sampled, supersample=factor, apron=apron), given) if not stays else sampled
     least = 1
     while True:
         sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)

@@ -116,10 +116,10 @@ class Joint:
         ids, proxy = fragments.triangle_ids, self.proxy
         covered = ids >= 0 if covered is None else covered
         assert proxy.ids is not None
-        counts, ids_of_parts, params, row, depth = packing_loops.pack(
+        counts, ids_of_parts, params, row, depth, _ = packing_loops.pack(
             fragments, covered, proxy.ids, proxy.corner_params, starts=self.starts
         )
-        return self._of_parts(counts, ids_of_parts, params, Cells(row, depth, ids))
+        return self.of_parts(counts, ids_of_parts, params, Cells(row, depth, ids))
 
     def _of_one_row_each(self, fragments: Fragments, covered: np.ndarray) -> Sampled:
         """Samples of fragments (K, H, W) of which one, at the first of its cells, stands for all cells of a part."""
@@ -132,9 +132,9 @@ class Joint:
         known = np.ones((1, 1, len(seen)), np.bool_), table.ids, table.corner_params
         counts, ids, params, *_ = packing_loops.pack(one, *known, starts=self.starts)
         depth = np.where(covered, fragments.depth, np.float32(0))
-        return self._of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
+        return self.of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
 
-    def _of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
+    def of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
         """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row.
 
         A single part has the cells of the image; several have a cell for each row.

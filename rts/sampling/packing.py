@@ -46,7 +46,7 @@ def pack_fragments(
         kept, _ = covered_cells(fragments.triangle_ids)
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
-    (total,), ids, params, row, depth = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0)
+    (total,), ids, params, row, depth, _ = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0)
     return Samples(ids, params, Cells(row, depth), np.asarray(max(0, total - len(ids)), np.int32))
 
 

@@ -18,10 +18,11 @@ def pack(
     corner_params: np.ndarray | None,
     capacity: int = 0,
     starts: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows for some cells, part after part, and those of a part layer by layer.
+    beside: Fragments | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows for some cells, part after part, and those of a part layer by layer; then for fragments beside.
 
-    A part without cells has one row, in the middle of its first triangle; zeros if it has no triangles. Cells without a
+    A part without any has one row, in the middle of its first triangle; zeros if it has no triangles. Cells without a
     row have −1 and 0. They are those that are not taken, and those beyond the capacity.
 
     Args:
@@ -31,32 +32,57 @@ def pack(
         corner_params: (T, 3, Q) float32, or None for the barycentrics themselves.
         capacity: rows to allot to a single part, zeros where they are not used; 0 for as many as are taken.
         starts: (P + 1,) int32, where the triangles of each part begin; None for one part.
+        beside: (1, 1, M), further fragments, all taken: rows of each part that follow those of its cells.
 
     Returns:
-        The number (P,) of cells of each part, ids (N, I), params (N, Q), and row and depth (K, H, W).
+        The number (P,) of rows in use of each part, ids (N, I), params (N, Q), row and depth (K, H, W), and the rows
+        (M,) of `beside`.
     """
-    count, sizes = kept.size, [len(table)] if starts is None else starts[1:] - starts[:-1]
-    part_of = np.empty(0, np.int32) if len(sizes) == 1 else np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    count, parts = kept.size, 1 if starts is None else len(starts) - 1
+    owners = _NO_PARTS if starts is None or parts == 1 else owners_of(starts)
+    corners = _NONE if corner_params is None else read_only(corner_params, np.float32)
+    table, width = read_only(table, np.int32), 2 if corner_params is None else corners.shape[2]
     # Each piece of the cells is counted, then packed, by itself: how many there are changes nothing.
     pieces = 1 if 8 * count < LITTLE_WORK else min(thread_count() * TASKS_PER_THREAD, count)
-    bounds, ahead = count * np.arange(pieces + 1) // pieces, np.zeros((pieces, len(sizes)), np.int64)
-    shares, depths = read_only(fragments.barycentrics, np.float32), read_only(fragments.depth, np.float32)
-    cells = read_only(kept).reshape(-1), read_only(fragments.triangle_ids, np.int32).reshape(-1)
-    parallel(_count, pieces, bounds, *cells, part_of, ahead, work=2 * count)
-    counts = ahead.sum(axis=0)
-    rows, width = np.maximum(counts, 1), 2 if corner_params is None else corner_params.shape[2]
-    total = capacity or int(rows.sum())
-    ahead = np.cumsum(ahead, axis=0) - ahead + np.cumsum(rows) - rows
+    bounds, ahead = count * np.arange(pieces + 1) // pieces, np.zeros((pieces + 1, parts), np.int64)
+    cells, row, depth = _listed(fragments, kept), np.empty(kept.shape, np.int32), np.empty(kept.shape, np.float32)
+    parallel(_count, pieces, bounds, *cells[:2], owners, ahead, work=2 * count)
+    others = _listed(_NOTHING, _NOWHERE) if beside is None else _listed(beside, np.ones(beside.depth.shape, np.bool_))
+    more, last = len(others[0]), ahead[pieces:]
+    of_more, rows, depths = np.array([0, more]), np.empty(more, np.int32), np.empty(more, np.float32)
+    _count(0, 1, of_more, *others[:2], owners, last)
+    counts, firsts = np.empty(parts, np.int64), np.empty(parts, np.int64)
+    used = _number(ahead, counts, firsts)
+    total = capacity or used
     make = np.zeros if capacity or not len(table) else np.empty
     ids, params = make((total, table.shape[1]), np.int32), make((total, width), np.float32)
-    for part in np.flatnonzero(counts == 0) if len(table) and not capacity else ():
-        first = rows[:part].sum()
-        ids[first], params[first] = middle_of(table, corner_params, 0 if starts is None else starts[part])
-    row, depth = np.empty(kept.shape, np.int32), np.empty(kept.shape, np.float32)
-    corners = np.empty((0, 3, 0), np.float32) if corner_params is None else read_only(corner_params, np.float32)
-    arrays = *cells, shares.reshape(-1, 2), depths.reshape(-1), part_of, read_only(table, np.int32), corners
-    parallel(_pack, pieces, bounds, ahead, *arrays, ids, params, row.reshape(-1), depth.reshape(-1), work=8 * count)
-    return counts, ids, params, row, depth
+    if len(table) and not capacity and not counts.all():
+        for part in np.flatnonzero(counts == 0):
+            triangle = 0 if starts is None else starts[part]
+            ids[firsts[part]], params[firsts[part]] = middle_of(table, corner_params, triangle)
+    known = owners, table, corners, ids, params
+    parallel(_pack, pieces, bounds, ahead, *cells, *known, row.reshape(-1), depth.reshape(-1), work=8 * count)
+    _pack(0, 1, of_more, last, *others, *known, rows, depths)
+    return counts, ids, params, row, depth, rows
+
+
+_NO_PARTS, _NONE = np.empty(0, np.int32), read_only(np.empty((0, 3, 0), np.float32))
+"""The parts of triangles where there is one; and parameters of corners where barycentrics are taken."""
+
+_NOTHING = Fragments(np.empty(0, np.int32), np.empty((0, 2), np.float32), np.empty(0, np.float32))
+_NOWHERE = np.empty(0, np.bool_)
+
+
+def owners_of(starts: np.ndarray) -> np.ndarray:
+    """The part (T,) int32 of each triangle, given where those of each part begin, `starts` (P + 1,)."""
+    return np.arange(len(starts) - 1, dtype=np.int32).repeat(starts[1:] - starts[:-1])
+
+
+def _listed(fragments: Fragments, kept: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Which fragments are kept, their triangles, barycentrics and depths, one after the other."""
+    triangles, shares, depths = fragments
+    arrays = read_only(triangles, np.int32), read_only(shares, np.float32), read_only(depths, np.float32)
+    return read_only(kept).reshape(-1), arrays[0].reshape(-1), arrays[1].reshape(-1, 2), arrays[2].reshape(-1)
 
 
 def middle_of(table: np.ndarray, corner_params: np.ndarray | None, triangle: int) -> tuple[np.ndarray, Any]:
@@ -75,9 +101,8 @@ def parts_of(triangles: np.ndarray, covered: np.ndarray, starts: np.ndarray) -> 
     if len(starts) == 2:
         at = int(covered.argmax())
         return covered.view(np.int8) - np.int32(1), np.array([at if covered.reshape(-1)[at] else -1])
-    sizes = starts[1:] - starts[:-1]
-    part_of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
-    row, first = np.empty(covered.shape, np.int32), np.full(len(sizes), -1, np.int64)
+    part_of = owners_of(starts)
+    row, first = np.empty(covered.shape, np.int32), np.full(len(starts) - 1, -1, np.int64)
     triangles, there = read_only(triangles, np.int32).reshape(-1), read_only(covered).reshape(-1)
     _parts_of(triangles, there, part_of, row.reshape(-1), first)
     return row, first
@@ -100,6 +125,24 @@ def _count(start, stop, bounds, there, triangles, part_of, counts):
         for m in range(bounds[piece], bounds[piece + 1]):
             if there[m]:
                 counts[piece, part_of[triangles[m]] if several else 0] += 1
+
+
+@loop
+def _number(ahead, counts, firsts):
+    """Make the counts `ahead` (pieces, P) the first rows of each piece in each part. Returns the number of all rows.
+
+    It fills in the number `counts` (P,) of each part, at least one of which is allotted, and its first row, `firsts`.
+    """
+    total = 0
+    for part in range(len(counts)):
+        firsts[part], n = total, total
+        for piece in range(len(ahead)):
+            count = ahead[piece, part]
+            ahead[piece, part] = n
+            n += count
+        counts[part] = n - total
+        total = max(n, total + 1)
+    return total
 
 
 @compiled
