@@ -42,10 +42,10 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     size = breaks.joined.shape[1:]
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, *size)
     # By squares; in each of them clockwise, part by part if outlines may cross.
-    group, order = square, np.argsort(square + 1j * along, kind="stable")  # By both, and faster than lexsort.
+    group, order = square, loops.order_of(square, along)
     if layered:
         group = loops.groups_of(order, square, ends)
-        order = np.argsort(group + 1j * along, kind="stable")
+        order = loops.order_of(group, along)
     known = breaks.place, breaks.tangent
     of_breaks = *known, breaks.cells_away
     origin, ties, square_sides, neighbours = loops.segments_of(order, group, square, ends, *of_breaks, size[1])

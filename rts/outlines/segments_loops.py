@@ -120,6 +120,21 @@ def _odd(first, stop, order, ends, e):
 
 
 @loop
+def order_of(group, along):
+    """(E,) int64: sorts ends by groups (E,) int64, and in each clockwise, by `along` (E,)."""
+    order, begin = np.argsort(group, kind="mergesort"), 0
+    for n in range(len(order)):
+        end, m = order[n], n
+        if n == 0 or group[order[n - 1]] != group[end]:
+            begin = n
+        while m > begin and along[order[m - 1]] > along[end]:
+            order[m] = order[m - 1]
+            m -= 1
+        order[m] = end
+    return order
+
+
+@loop
 def groups_of(order, square, ends):
     """(E,) int64: which ends of a square may be joined where light passes through: those of one part, and crossings.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -85,7 +86,7 @@ class Sheets(NamedTuple):
                 shifts = np.cumsum([0, *(len(x.vertices) for x in every)], dtype=np.int32)
                 moved = [table + shift for table, shift in zip(tables, shifts, strict=False)]
                 faces = read_only(tables[0] if len(moved) == 1 else np.concatenate(moved), np.int32)
-        starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
+        starts = np.array([0, *itertools.accumulate(map(len, tables))], np.int32)
         beyond = [_beyond(table) for table in tables]
         if len(beyond) > 1:
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
@@ -126,14 +127,16 @@ class Sheets(NamedTuple):
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
         of_triangles = self.faces, self.seen, self.sides, self.keep, close
         parallel(spans_loops.most_spans, count, *of_triangles, gaps.rows, gaps.columns, most, work=40 * count)
-        triangles = np.flatnonzero(most)
+        (triangles,) = most.nonzero()
         most = most[triangles]
-        begins = np.cumsum(most) - most
-        names, spans = np.full((most.sum(), 3), -1, np.int32), np.empty((most.sum(), 9 if seams else 6))
+        ends = most.cumsum()
+        begins, total = ends - most, int(ends[-1]) if len(ends) else 0
+        names, spans = np.empty((total, 3), np.int32), np.empty((total, 9 if seams else 6))
+        names[:, 0] = -1
         mesh = self.rows, self.vertices, self.faces, self.beyond, self.clip, self.keep, self.seen
         arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
-        part = np.searchsorted(self.starts[1:-1], names[:, 1], side="right") + self.first
+        part = self.starts[1:-1].searchsorted(names[:, 1], "right") + self.first
         return names, spans, part.astype(np.int32)
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> Fragments:

@@ -18,6 +18,9 @@ TINY = 1e-9
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
 
+FEW = 32
+"""Spans of a gap that are sorted one by one, which is the fastest way for so few."""
+
 SLACK = np.float32(0.01)
 """By how much boxes of triangles are larger than these, against rounding, in cells."""
 
@@ -196,7 +199,7 @@ def spans_of(
         by_column: see `Gaps`.
         names: (N, 3) int32 to fill, of each span the gap, the triangle, and a sum: 1 if it starts at an edge that no
             other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; or 0 if `spans` have no normals.
-            Filled with −1.
+            The gaps of those that are left out stay as they are, −1.
         spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d. Or (N, 9), with the triangle's unit normal
             on the side that is seen, in the proxy's space, where it starts or ends at such an edge.
     """
@@ -349,5 +352,14 @@ def by_gap(gaps, count):
 def by_start(first, last, begins, starts, order):
     """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start."""
     for g in range(first, last):
-        own = order[begins[g] : begins[g + 1]]
-        own[:] = own[np.argsort(starts[own], kind="mergesort")]
+        begin, stop = begins[g], begins[g + 1]
+        if stop - begin > FEW:
+            own = order[begin:stop]
+            own[:] = own[np.argsort(starts[own], kind="mergesort")]
+            continue
+        for n in range(begin + 1, stop):
+            span, m = order[n], n
+            while m > begin and starts[order[m - 1]] > starts[span]:
+                order[m] = order[m - 1]
+                m -= 1
+            order[m] = span

@@ -21,6 +21,7 @@ from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
+from rts.scene.transforms import determinant
 
 MOST = 2**15
 """Triangles of a part that is joined to others: moving the vertices of a larger one costs more than a pass over the
@@ -139,11 +140,13 @@ class Joint:
 
         A single part has the cells of the image; several have a cell for each row.
         """
-        samples, none, stop, whole = [], np.asarray(0, np.int32), 0, Cells(cells.row, cells.depth)
+        samples, none, stop = [], np.zeros((), np.int32), 0
         for part, count in zip(self.parts, counts.tolist(), strict=True):
             start, stop = stop, stop + max(count, 1)
-            used = np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count)
-            own = whole if len(counts) == 1 else Cells(used)
+            if len(counts) == 1:
+                own = Cells(cells.row, cells.depth)
+            else:
+                own = Cells(np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count))
             samples.append(Samples(ids[start:stop], params[start:stop], own, none, gbuffer_names=part.reads))
         return Sampled(tuple(samples), cells, none)
 
@@ -176,7 +179,7 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
 
     def kind(index: int) -> tuple:
         proxy = proxies[index]
-        mirrored = scene.parts[index].cull == "back" and np.linalg.det(cameras[index].view[:3, :3]) < 0
+        mirrored = scene.parts[index].cull == "back" and determinant(cameras[index].view) < 0
         tables = (None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params))
         return 0 < len(proxy.faces) <= MOST and not mirrored, *tables
 

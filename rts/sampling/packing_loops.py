@@ -56,7 +56,7 @@ def pack(
     total = capacity or used
     make = np.zeros if capacity or not len(table) else np.empty
     ids, params = make((total, table.shape[1]), np.int32), make((total, width), np.float32)
-    if len(table) and not capacity and not counts.all():
+    if len(table) and not capacity and 0 in counts.tolist():
         for part in np.flatnonzero(counts == 0):
             triangle = 0 if starts is None else starts[part]
             ids[firsts[part]], params[firsts[part]] = middle_of(table, corner_params, triangle)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rts.contracts.records import Fragments, Proxy
 from rts.scene.camera import Camera
+from rts.scene.transforms import determinant
 
 
 def at_points(
@@ -59,6 +62,6 @@ def near_and_far(camera: Camera) -> np.ndarray:
 
 def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """`Camera.spread` of host matrices, float64, for images of `size`."""
-    p, view = camera.projection, camera.view
-    area = 4 / (size[0] * size[1] * abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return np.sqrt(area) * abs(np.linalg.det(view[:3, :3])) ** (-1 / 3) * np.array([p[3, 3], -p[3, 2]])
+    (a, b, *_), (c, d, *_), _, (*_, e, f) = camera.projection.tolist()
+    area = 4 / (size[0] * size[1] * abs(a * d - b * c))
+    return math.sqrt(area) * abs(determinant(camera.view)) ** (-1 / 3) * np.array([f, -e])

@@ -29,6 +29,7 @@ from rts.operations.unit import unit
 from rts.scene.camera_converters import CameraConverters
 from rts.scene.rays import Rays
 from rts.scene.transforms import (
+    determinant,
     in_one_engine,
     is_affine,
     look_at,
@@ -350,8 +351,8 @@ class Camera(CameraConverters):
         """
         if cull != "back":
             return 0.0
-        p = self.projection
-        return -float(np.sign(np.linalg.det(self.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])))
+        (a, b, *_), (c, d, *_) = self.projection[:2].tolist()
+        return -float(np.sign(determinant(self.view) * (a * d - b * c)))
 
     def turned(self) -> Camera:
         """An equivalent camera that looks along −z, for a camera that looks along +z."""

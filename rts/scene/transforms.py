@@ -19,6 +19,12 @@ from rts.operations.linear import matmul
 from rts.operations.unit import unit
 
 
+def determinant(matrix: np.ndarray) -> float:
+    """The determinant of the first three rows and columns of a host matrix: NumPy's takes ten times as long."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3].tolist()
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:
     """A matrix of array scalars and numbers, in the dtype of `like`, a scalar of their engine."""
     zero = xp.zeros_like(like)
