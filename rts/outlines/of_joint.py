@@ -1,79 +1,105 @@
-"""Parts of triangles that are drawn at once: their samples and the stencil, in one table from the first.
+"""Scenes of triangles: all samples and the stencil, found on the host in one table.
 
 A part's rows are those at centres, then those beside breaks, so that nothing is numbered anew.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from rts.compiling.threads import parallel, read_only
+from rts.compiling.threads import parallel
 from rts.contracts.records import Cells, Fragments, Sampled
-from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import Breaks, Fronts
+from rts.outlines.beside import Beside, breaks_of_sheets, limited
+from rts.outlines.found import Outlines, Told, fits
+from rts.outlines.gaps import Fronts
 from rts.outlines.sheets import Sheets
-from rts.outlines.spans import breaks_of_triangles
 from rts.sampling.camera_checks import on_host
-from rts.sampling.joint import Joint
+from rts.sampling.joint import Joint, is_suited
 from rts.sampling.points import pixel_widths
-from rts.sampling.sample_checks import check_fragments
-from rts.sampling.scene import Grid
+from rts.sampling.scene import Grid, Scene
 
 
-def sampled_fronts(joint: Joint, grid: Grid, told: Told, uniform: bool, real: Any) -> Sampled:
-    """The samples in front, at centres and beside breaks, of parts that are drawn at once, with their stencil.
+class AtOnce:
+    """A scene of triangles, all of which are drawn and sampled at once, and the cells that see it."""
 
-    Args:
-        joint: all parts of a scene.
-        grid: the cells.
-        told: what samples beside breaks have to tell.
-        uniform: whether one sample stands for all cells of a part.
-        real: the dtype of weights.
-    """
-    from rts.outlines import samples_loops
-    from rts.sampling import packing_loops
+    def __init__(self, joint: Joint, grid: Grid, opaque: Sequence[bool]):
+        """Take the parts, and the cells. Behind those that are `opaque`, for each part, nothing is sampled."""
+        self._joint, self._grid, self._opaque = joint, grid, np.array(opaque, np.bool_)
+        self._fragments: Fragments | None = None
 
-    size, proxy = grid.size, joint.proxy
-    fragments = joint.sampler.rasterize(joint.prepared, joint.camera, size, 1, joint.cull)
-    covered = check_fragments(fragments, (1, *size), len(proxy.faces), joint.sampler)
-    triangle, depth = (read_only(x[0]) for x in (fragments.triangle_ids, fragments.depth))
-    owners, part, deep = packing_loops.owners_of(joint.starts), np.empty(size, np.int32), np.empty(size)
-    parallel(samples_loops.fronts, size[0], triangle, depth, owners, part, deep, work=2 * part.size)
-    sheets = Sheets.of(proxy, joint.camera, size, joint.cull, joint.first, joint.proxies, told.colors)
-    width = pixel_widths(on_host(grid.camera).for_size(size), size)
-    breaks = breaks_of_triangles(Fronts(part, triangle, deep), (sheets,), width, told.colors)
-    place, beside = _beside(breaks, sheets, told)
-    known = proxy.ids, proxy.corner_params
-    if uniform:  # One fragment of each part, at the first of its cells.
-        _, first = packing_loops.parts_of(triangle, covered[0], joint.starts)
-        seen = first[first >= 0]
-        cells = Fragments(*(x.reshape(-1, *x.shape[3:])[seen] for x in fragments))
-        counts, ids, params, found, _, rows = packing_loops.pack(
-            cells, np.ones(len(seen), np.bool_), *known, starts=joint.starts, beside=beside
+    @classmethod
+    def of(cls, scene: Scene, grid: Grid, opaque: Sequence[bool]) -> AtOnce | None:
+        """A scene on the host; None if some part has to be sampled by itself."""
+        suited = all(map(is_suited, scene.parts, scene.samplers))
+        return cls(Joint.of(scene, grid), grid, opaque) if suited else None
+
+    def centres(self, layers: int) -> Sampled:
+        """What is seen at centres (K, H, W): `Sampled.row` has parts, `samples` are told by `found`."""
+        from rts.outlines import samples_loops
+        from rts.sampling import packing_loops
+
+        shape = layers, *self._grid.size
+        self._fragments = self._joint.drawn(self._grid.size, layers)
+        part, triangle, depth = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, np.float32)
+        owners, seen = packing_loops.owners_of(self._joint.starts), self._fragments[::2]
+        known = *seen, owners, self._opaque, part, triangle, depth
+        parallel(samples_loops.fronts, shape[1], *known, work=3 * part.size)
+        return Sampled((), Cells(part, depth, triangle), np.zeros((), np.int32))
+
+    def found(
+        self, seen: Sampled, told: Told | None, real: Any, uniform: bool = False, most: int | None = None
+    ) -> Sampled:
+        """The samples at centres, those beside breaks, and the stencil.
+
+        Args:
+            seen: what `centres` gave last, or its first layers, or fewer cells.
+            told: what samples beside breaks have to tell; None for none, and no stencil.
+            real: the dtype of weights.
+            uniform: whether one sample stands for all cells of a part, of one layer.
+            most: the breaks for whose stencil there is room; None for any. `overflow` counts those left out.
+        """
+        if told is None:
+            return self._sampled(seen, None, uniform)[0]
+        joint, size, count = self._joint, self._grid.size, most
+        sheets = Sheets.of(
+            joint.proxy, joint.camera, size, "none", 0, joint.proxies, seams=told.colors, keep=joint.signs
         )
-        row_of = np.full(len(first) + 1, -1, np.int32)
-        row_of[:-1][first >= 0] = found
-        row, depth = row_of.take(part)[None], deep.astype(np.float32)[None]
-    else:
-        counts, ids, params, row, depth, rows = packing_loops.pack(
-            fragments, covered, *known, starts=joint.starts, beside=beside
+        width = pixel_widths(on_host(self._grid.camera).for_size(size), size)
+        layers = Fronts(seen.row, seen.triangle, seen.depth.astype(np.float64))
+        find = partial(breaks_of_sheets, layers, self._opaque, (sheets,), width)
+        while True:
+            breaks, stacks, left = limited(find, count, told.colors)
+            wanted, sides = Beside.of(breaks, stacks, told), None if stacks is None else stacks.sides
+            sampled, rows = self._sampled(seen, sheets.at(wanted.triangle, wanted.points), uniform)
+            outlines = Outlines.of(breaks, wanted.table(len(breaks.gap), rows), sides, left)
+            stencil = outlines.stencil(sampled.row, told, real)
+            if fits(stencil, most) or not count:
+                return replace(sampled, stencil=stencil, overflow=seen.overflow + np.int32(left))
+            count = min(count, len(breaks.gap)) // 2
+
+    def _sampled(self, seen: Sampled, beside: Fragments | None, uniform: bool) -> tuple[Sampled, np.ndarray]:
+        """The samples at centres, and those of fragments (1, 1, M) beside breaks, whose rows (M,) are told."""
+        from rts.sampling import packing_loops
+
+        joint, part, depth = self._joint, seen.row, seen.depth
+        starts, known = joint.starts, (joint.proxy.ids, joint.proxy.corner_params)
+        assert self._fragments is not None
+        fragments, kept = Fragments(*(x[: len(part)] for x in self._fragments)), part >= 0
+        if uniform:  # One fragment of each part, at the first of its cells.
+            first = packing_loops.firsts_of(part, len(starts) - 1)
+            there = first >= 0
+            fragments = Fragments(*(x.reshape(-1, *x.shape[3:])[first[there]] for x in fragments))
+            kept = np.ones(len(fragments.depth), np.bool_)
+        counts, ids, params, row, depths, rows = packing_loops.pack(
+            fragments, kept, *known, starts=starts, beside=beside
         )
-    of_breaks = np.full((len(breaks.gap), 6), -1, np.int32)
-    of_breaks.reshape(-1)[place] = rows
-    stencil = Outlines.of(breaks, of_breaks).stencil(row, told, real)
-    sampled = joint.of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
-    return replace(sampled, stencil=stencil)
-
-
-def _beside(breaks: Breaks, sheets: Sheets, told: Told) -> tuple[np.ndarray, Fragments]:
-    """The fragments (1, 1, M) beside breaks, and their places (M,) in `Outlines.rows`."""
-    from rts.outlines import samples_loops
-
-    most = 4 * len(breaks.gap)
-    place, triangles, points = np.empty(most, np.int32), np.empty(most, np.int32), np.empty((most, 2))
-    of_breaks = breaks.parts, breaks.ends, breaks.points, breaks.inner, breaks.triangles
-    count = samples_loops.needed(*of_breaks, *told, place, triangles, points)
-    return place[:count], sheets.at(triangles[:count], points[:count])
+        if uniform:
+            row_of = np.full(len(first) + 1, -1, np.int32)
+            row_of[:-1][there] = row
+            row, depths = row_of.take(part), depth
+        return replace(joint.of_parts(counts, ids, params, Cells(row, depths)), overflow=seen.overflow), rows

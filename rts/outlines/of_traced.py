@@ -18,12 +18,12 @@ from rts.compiling.threads import OnAllCores
 from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Told, arrays_of, fits, specs
-from rts.outlines.of_scene import most_breaks, with_outlines
+from rts.outlines.of_joint import AtOnce
+from rts.outlines.of_scene import most_breaks
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
 from rts.sampling.host_scenes import from_values, real_of, values_of
-from rts.sampling.joint import is_suited, with_joints
-from rts.sampling.merging import sampled_parts
+from rts.sampling.joint import Joint, is_suited
 from rts.sampling.picture import Picture, at_once, renumbered
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import DrawnView, joined
@@ -131,10 +131,14 @@ class _Call:
     def _one(self, *arrays: np.ndarray) -> list[np.ndarray]:
         """The results of one item."""
         scene, grid = self._entered(arrays)
-        scene = with_joints(scene, grid)
-        sampled = self._limited(sampled_parts(scene, grid, self._request, self._layers))
-        sampled = with_outlines(sampled, scene, grid, self._told, most=self._most)
-        return self._results([sampled])[0]
+        return self._results([self._found(AtOnce(Joint.of(scene, grid), grid, scene.opaque), self._most)])[0]
+
+    def _found(self, at_once: AtOnce, most: int | None) -> Sampled:
+        """The samples, at most `capacity` of each part at centres, and the stencil of at most `most` breaks."""
+        seen, uniform = at_once.centres(self._layers), self._request.uniform
+        if not uniform and self._capacity is not None:
+            seen = _limited(seen, self._capacity)
+        return at_once.found(seen, self._told, real_of(self._scene), uniform, most)
 
     def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         """The results of several items; None for those that cannot be drawn along with others, or lack room."""
@@ -158,11 +162,8 @@ class _Call:
     def _side_by_side(self, views: Sequence[DrawnView]) -> Iterator[Sampled]:
         """The samples of each of several views of one kind, drawn in one picture."""
         picture = Picture.of(len(views), self._size)
-        scene, grid = joined(views, picture)
-        request = self._request
-        sampled = scene.joints[0].sampled(picture.size, self._layers, request.triangles, request.uniform)
-        here = scene._replace(context=self._context)
-        sampled = with_outlines(self._limited(sampled), here, grid, self._told)
+        scene, grid, joint = joined(views, picture)
+        sampled = self._found(AtOnce(joint, grid, scene.opaque), None)
         assert sampled.stencil is not None
         count = len(self._scene.parts)
         tables = [sampled.samples[first : first + count] for first in range(0, len(sampled.samples), count)]
@@ -172,26 +173,6 @@ class _Call:
             row, depth = (x[:, *place] for x in (sampled.row, sampled.depth))
             own = own.with_samples(partial(_moved, shift=-start))
             yield replace(sampled, samples=of_view, cells=Cells(_moved(row, -start), depth), stencil=own)
-
-    def _limited(self, sampled: Sampled) -> Sampled:
-        """Samples at centres, at most `capacity` of each part; those of the last layers are left out."""
-        capacity, counts = self._capacity, [len(samples.ids) for samples in sampled.samples]
-        if capacity is None or max(counts) <= capacity:
-            return sampled
-        starts = np.cumsum([0, *counts])
-        place, kept, start = np.full(starts[-1] + 1, -1, np.int32), [], 0
-        for first, samples in zip(starts, sampled.samples, strict=False):
-            count = min(len(samples.ids), capacity)
-            place[first : first + count] = np.arange(start, start + count)
-            start += count
-            own = samples.row[..., :count] if len(samples.row[0]) == 1 else samples.row
-            kept.append(samples.replace(ids=samples.ids[:count], params=samples.params[:count], row=own))
-        row = place[sampled.row]
-        left = np.asarray(np.count_nonzero((sampled.row >= 0) & (row < 0)), np.int32)
-        if left:
-            warn(f"{left} samples find no room in capacity={capacity}; give the compiled program more", InputWarning)
-        cells = Cells(row, np.where(row >= 0, sampled.depth, np.float32(0)), np.where(row >= 0, sampled.triangle, -1))
-        return replace(sampled, samples=tuple(kept), cells=cells, overflow=sampled.overflow + left)
 
     def _results(self, items: Sequence[Sampled]) -> list[list[np.ndarray]]:
         """The results of items: for each part a count, tables and attributes, then cells, overflow and stencil."""
@@ -231,6 +212,23 @@ class _Call:
         ends = np.cumsum([len(table.ids) for table in tables])[:-1]
         split = [np.split(np.asarray(gbuffer[name], spec.dtype), ends) for name, spec in specs.items()]
         return [list(of_item) for of_item in zip(*split, strict=True)]
+
+
+def _limited(seen: Sampled, capacity: int) -> Sampled:
+    """What is seen at centres, at most so much of each part; what is left out lies in its last layers."""
+    part = seen.row.reshape(-1)
+    order = np.argsort(part, kind="stable")
+    ordered = part[order]
+    beyond = np.arange(len(part)) - np.searchsorted(ordered, ordered) >= capacity
+    left = order[beyond & (ordered >= 0)]
+    if not len(left):
+        return seen
+    warn(f"{len(left)} samples find no room in capacity={capacity}; give the compiled program more", InputWarning)
+    cells = seen.cells.map(np.copy)
+    for x, none in ((cells.row, -1), (cells.depth, 0), (cells.triangle, -1)):
+        assert isinstance(x, np.ndarray)
+        x.reshape(-1)[left] = none
+    return replace(seen, cells=cells, overflow=np.int32(seen.overflow + len(left)))
 
 
 def _moved(rows: Array, shift: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,10 @@ from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
+from rts.outlines.beside import Beside, breaks_of_sheets, limited
 from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import Breaks, Fronts, Gaps, Hints, Oracle, find_breaks
+from rts.outlines.gaps import Breaks, Fronts, Gaps, Hints, Oracle, Stacks, find_breaks
 from rts.outlines.sheets import Sheets
-from rts.outlines.spans import breaks_of_triangles
-from rts.outlines.stacks import breaks_of_stacks
 from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.sampling.camera_checks import on_host
@@ -33,33 +32,11 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 
-class _Broken(NamedTuple):
-    """Breaks, and the samples that they need. Host arrays.
-
-    Attributes:
-        breaks: the breaks.
-        parts: (B, R), the parts of samples, or −1.
-        points: (B, R, 2), where they are.
-        triangles: (B, R), on which they are; −1 where none is known.
-        numbers: (B, R), how many layers of the same part are in front; 0 where triangles are known.
-        sides: see `Outlines.sides`.
-        left: number of breaks left out.
-    """
-
-    breaks: Breaks
-    parts: np.ndarray
-    points: np.ndarray
-    triangles: np.ndarray
-    numbers: np.ndarray
-    sides: np.ndarray
-    left: int
-
-
 class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], told: Told):
-        """Take of each part its sampler, camera, entry and, where triangles tell all, sheets, shared by joint parts."""
+        """Take of each part its sampler, camera, entry and, where triangles tell all, sheets."""
         self._scene, self._grid, self._parts, self._told = scene, grid, parts, told
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
@@ -73,16 +50,12 @@ class Points:
             inputs: of each part's proxy, on the host; read where the part has no entry.
             told: what samples have to tell.
         """
-        parts, joints = [], {joint.first: joint for joint in scene.joints}
+        parts = []
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
-            camera, sheets, joint = scene.local_camera(index, grid), None, joints.get(index)
-            if joint is not None:
-                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies, told.colors)
-            elif parts and parts[-1][3] is not None and index in parts[-1][3].parts:
-                sheets = parts[-1][3]
-            elif isinstance(sampler, TriangleSampler):
+            camera, sheets = scene.local_camera(index, grid), None
+            if isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if has_sheets(part, sampler):
@@ -96,35 +69,19 @@ class Points:
 
         `Outlines.rows` are counted in each part; in the middle there are these parts, int32, of the same shape, or −1.
         """
-        broken = self._broken(layers, most)
-        rows, samples = np.full(broken.parts.shape, -1, np.int32), []
-        joints = {joint.first: joint for joint in self._scene.joints}
-        while (part := len(samples)) < len(self._parts):
-            joint = joints.get(part)
-            inside = (broken.parts >= part) & (broken.parts < (part + 1 if joint is None else joint.stop))
-            points = broken.points[inside]
-            fragments = self._on_sheets(part, points, broken.triangles[inside])
-            if joint is not None:
-                assert fragments is not None
-                lifted = joint.lifted(fragments)
-                firsts = np.cumsum([0, *(len(one.ids) for one in lifted.samples)], dtype=np.int32)
-                samples += lifted.samples
-                rows[inside] = host_value(lifted.row)[0, 0] - firsts[broken.parts[inside] - part]
-                continue
-            one, rows[inside] = self._of_layers(part, points, broken.numbers[inside], fragments)
+        breaks, stacks, left = limited(functools.partial(self._breaks, layers), most, self._told.colors)
+        wanted, samples = Beside.of(breaks, stacks, self._told), []
+        found = np.empty(len(wanted.part), np.int32)
+        for part in range(len(self._parts)):
+            (inside,) = (wanted.part == part).nonzero()
+            points = wanted.points[inside]
+            fragments = self._on_sheets(part, points, wanted.triangle[inside])
+            one, found[inside] = self._of_layers(part, points, wanted.number[inside], fragments)
             samples.append(one)
-        return *self._found(broken, rows, samples), samples
-
-    def _found(
-        self, broken: _Broken, rows: np.ndarray, samples: list[Samples]
-    ) -> tuple[Outlines, np.ndarray]:
-        """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
-        breaks, parts, _, _, _, sides, left = broken
-        layered = sides.shape[-1] > 0
-        if not layered:
-            pairs, of_pairs = self._pairs(breaks, samples)
-            rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
-        return Outlines.of(breaks, rows, sides if layered else None, left), parts
+        rows, parts = (wanted.table(len(breaks.gap), x) for x in (found, wanted.part))
+        if stacks is None:
+            rows[:, 4:], parts[:, 4:] = self._pairs(breaks, samples)
+        return Outlines.of(breaks, rows, None if stacks is None else stacks.sides, left), parts, samples
 
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
@@ -151,53 +108,16 @@ class Points:
             samples[index] = in_one_table([samples[index], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
 
-    def _broken(self, layers: Fronts, most: int | None) -> _Broken:
-        """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
-        breaks, *others = self._breaks(layers, self._told.colors)
-        count, left = len(breaks.gap), 0
-        if most is not None and count > most:
-            if self._told.colors:  # Outlines come before seams.
-                breaks, *others = self._breaks(layers, False)
-            left = count - min(most, len(breaks.gap))
-            warn(
-                f"{left} breaks of outlines find no room beside {most}, and edges there neither move nor are smooth; "
-                f"give the compiled program capacity={4 * count} or more",
-                InputWarning,
-            )
-            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-            others = [x[:most] for x in others]
-        return _Broken(breaks, *others, left)
-
-    def _breaks(
-        self, layers: Fronts, seams: bool
-    ) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """All breaks, and the other arrays of `_Broken`; with those at seams, if they are wanted."""
-        every, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
-        known, count = None not in every, len(layers.part)
-        sheets = list({id(sheet): sheet for sheet in every}.values())
-        if count == 1 and known:
-            breaks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width, seams)
-            stacks = None
-        elif known:
-            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width, seams)
-        else:
-            oracle = Oracle(functools.partial(self._layers, count=count), self._width)
-            breaks, stacks = find_breaks(_lit(layers, opaque), oracle, self._hints(layers))
-        if count == 1 or stacks is None:
-            # For each break the two last samples, which tell motions, and the two that tell colours.
-            points, triangles = np.concatenate([breaks.points, breaks.inner], 1), breaks.triangles
-            told, first, none = self._told, breaks.parts, np.full_like(breaks.parts, -1)
-            if not told.motions:
-                if told.centers:  # What lies behind a break that is not the last.
-                    first = np.column_stack([none[:, 0], np.where(breaks.ends[:, 1], -1, first[:, 1])])
-                else:  # Those that tell colours come first, and are alone.
-                    points, triangles = np.roll(points, 2, axis=1), np.roll(triangles, 2, axis=1)
-            parts = np.concatenate([first, breaks.parts if told.samples(1) == 4 else none], 1)
-            return breaks, parts, points, triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
-        parts = np.concatenate([stacks.last, stacks.parts], 1)
-        points = np.concatenate([breaks.points, stacks.points], 1)
-        triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
-        return breaks, parts, points, triangles, stacks.numbers, stacks.sides
+    def _breaks(self, layers: Fronts, seams: bool) -> tuple[Breaks, Stacks | None]:
+        """All breaks, with those at seams, if they are wanted; and stacks there, of several layers."""
+        sheets, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
+        count = len(layers.part)
+        layers = layers if count == 1 else _lit(layers, opaque)
+        if None not in sheets:
+            return breaks_of_sheets(layers, opaque, sheets, self._width, seams)
+        oracle = Oracle(functools.partial(self._layers, count=count), self._width)
+        breaks, stacks = find_breaks(layers, oracle, self._hints(layers))
+        return breaks, stacks if count > 1 else None
 
     def _hints(self, layers: Fronts) -> Hints | None:
         """Places in gaps where triangles are whose silhouettes lie there, though surfaces may be a little beside them.
@@ -209,7 +129,7 @@ class Points:
             if sheet is None and isinstance(sampler, TriangleSampler):
                 host, cull = on_host(camera.for_size(self._grid.size)), self._scene.parts[index].cull
                 sheet = Sheets.of(entry.proxy, entry.proxy.seen_by(host), self._grid.size, cull, index)
-            if sheet is not None and not any(sheet is other for other in several):
+            if sheet is not None:
                 several.append(sheet)
         if not several:
             return None

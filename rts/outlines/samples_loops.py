@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rts.compiling.loops import loop
 
 
 @loop
-def fronts(first, last, triangle, depth, owners, part, deep):
-    """Fill in the fields of `Fronts` in lines `first` to `last`, from a layer of fragments.
+def fronts(first, last, seen, depth, owners, opaque, part, triangle, deep):
+    """Fill in the fields of `Fronts` in lines `first` to `last`, from fragments; nothing behind an opaque part.
 
     Args:
         first: the first line.
         last: the line after the last.
-        triangle: (H, W) int32, counted over all parts; −1 where nothing is seen.
-        depth: (H, W) float32.
+        seen: (K, H, W) int32, triangles counted over all parts; −1 where nothing is seen.
+        depth: (K, H, W) float32.
         owners: (T,) int32, the part of each triangle; no rows for a single part.
-        part: (H, W) int32 to fill.
-        deep: (H, W) float64 to fill with depths; 0 where nothing is seen.
+        opaque: (P,) bool.
+        part: (K, H, W) int32 to fill.
+        triangle: (K, H, W) int32 to fill.
+        deep: (K, H, W) float32 to fill with depths; 0 where nothing is seen.
     """
     several = len(owners) > 0
+    hidden = np.empty(seen.shape[2], np.bool_)
     for y in range(first, last):
-        for x in range(part.shape[1]):
-            t = triangle[y, x]
-            part[y, x] = -1 if t < 0 else (owners[t] if several else 0)
-            deep[y, x] = depth[y, x] if t >= 0 else 0.0
+        hidden[:] = False
+        for k in range(len(seen)):
+            for x in range(seen.shape[2]):
+                t = np.int32(-1) if hidden[x] else seen[k, y, x]
+                own = -1 if t < 0 else (owners[t] if several else 0)
+                part[k, y, x], triangle[k, y, x], deep[k, y, x] = own, t, depth[k, y, x] if t >= 0 else np.float32(0)
+                hidden[x] |= own >= 0 and opaque[own]
 
 
 @loop
-def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, place, triangles, positions):
+def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, place, own, triangles, positions):
     """List the samples beside breaks that tell colours and motions; returns their number.
 
     Args:
@@ -41,6 +49,7 @@ def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, plac
         centers: likewise.
         place: (4 B,) int32 to fill: places in `Outlines.rows`, of two samples that tell motions and two that tell
             colours; where nothing moves, these are in place of the former.
+        own: (4 B,) int32 to fill: the parts.
         triangles: (4 B,) int32 to fill.
         positions: (4 B, 2) to fill.
     """
@@ -55,7 +64,8 @@ def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, plac
             if parts[b, side] < 0 or not told:
                 continue
             at_break = i < 2 if motions else centers
-            place[n], triangles[n] = 6 * b + i, of_breaks[b, side if at_break else 2 + side]
+            place[n], own[n] = 6 * b + i, parts[b, side]
+            triangles[n] = of_breaks[b, side if at_break else 2 + side]
             for axis in range(2):
                 positions[n, axis] = points[b, side, axis] if at_break else inner[b, side, axis]
             n += 1

@@ -28,7 +28,7 @@ class Sheets(NamedTuple):
             at seams, if they are wanted.
         rows: (4, 4), see `Camera.pixel_rows`.
         clip: (2, 4) near and far plane, positive on what is seen.
-        keep: sign of the determinants on screen of triangles to keep; 0 for both.
+        keep: (T,) int8, the sign of the determinants on screen of triangles that are kept; 0 for both.
         seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
         sides: (T + 1,) int8, which side of triangles is seen, and 0; see `silhouettes_loops.turns`.
     """
@@ -40,7 +40,7 @@ class Sheets(NamedTuple):
     beyond: np.ndarray
     rows: np.ndarray
     clip: np.ndarray
-    keep: float
+    keep: np.ndarray
     seen: np.ndarray
     sides: np.ndarray
 
@@ -59,6 +59,7 @@ class Sheets(NamedTuple):
         first: int = 0,
         proxies: Sequence[Proxy] = (),
         seams: bool = False,
+        keep: np.ndarray | None = None,
     ) -> Sheets:
         """The sheets of a proxy.
 
@@ -70,6 +71,7 @@ class Sheets(NamedTuple):
             first: the index of the first part.
             proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; none for one.
             seams: whether sheets end at seams (`Proxy.corners`), too.
+            keep: see above; None for what `cull` says.
         """
         from rts.outlines import sheets_loops, silhouettes_loops
 
@@ -92,8 +94,8 @@ class Sheets(NamedTuple):
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
         beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))
-        planes, keep = near_and_far(camera), camera.kept_sign(cull)
-        return cls(first, starts, vertices, faces, beyond, rows, planes, keep, seen, sides)
+        keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
+        return cls(first, starts, vertices, faces, beyond, rows, near_and_far(camera), keep, seen, sides)
 
     def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.
@@ -115,7 +117,7 @@ class Sheets(NamedTuple):
 
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
         part_range = np.int32(self.parts.start), np.int32(self.parts.stop)
-        arguments = *map(read_only, fronts), part_range, *mesh, self.keep != 0, met, joined
+        arguments = *map(read_only, fronts), part_range, *mesh, self.keep, met, joined
         parallel(sheets_loops.seams, height, *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

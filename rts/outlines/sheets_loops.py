@@ -137,7 +137,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, beyond, one_sided, met, joined):
+def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, beyond, keep, met, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
@@ -152,7 +152,7 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         beyond: (T, 3), the result of `neighbours`.
-        one_sided: True if only one side of triangles is seen, so that two which share an edge do not fold there.
+        keep: (T,), see `spans_loops.spans_of`: where one side of triangles is seen, two that share an edge do not fold.
         met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.meet`.
         joined: (2, H, W) bool to fill: along x, and along y.
     """
@@ -174,7 +174,7 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s
-                next_ = one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
+                next_ = keep[t] != 0 and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
                 # Around a corner that two triangles have in common the sheet neither ends nor turns away.
                 if not next_ and (met[axis, y, x] != 0 or not _touch(faces, t, s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)

@@ -62,7 +62,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         near_plane: (4,), positive on what is seen.
-        keep: sign of the determinants of triangles to keep; 0 keeps both.
+        keep: (T,), see `spans_loops.spans_of`.
         seen: (V, 2), see `sheets_loops.projected`.
         beyond: (T, 3), see `sheets_loops.neighbours`.
         sides: (T + 1,), see `turns`; the last is 0, of the triangle −1, which is none.
@@ -74,7 +74,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
     ends, deep = np.empty((2, 2)), np.empty(2)
     for t in range(first, last):
         side = sides[t]
-        if side == 0 or side * keep < 0:
+        if side == 0 or side * keep[t] < 0:
             continue
         # In most triangles all three neighbours go on: one branch.
         on = (sides[beyond[t, 0]] * side > 0) & (sides[beyond[t, 1]] * side > 0) & (sides[beyond[t, 2]] * side > 0)
@@ -83,7 +83,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         for c in range(3):
             s = beyond[t, c]
             # Two kept triangles that fold have an edge in common, which is told once.
-            if s >= 0 and (sides[s] * side > 0 or (keep == 0 and s < t and sides[s] != 0)):
+            if s >= 0 and (sides[s] * side > 0 or (keep[t] == 0 and s < t and sides[s] != 0)):
                 continue
             a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
             if not _passes_centres(a, b, seen) or not _in_image(a, b, seen, part.shape):

@@ -144,7 +144,7 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
     box = np.empty(4, np.float32)
     for t in range(first, last):
         most[t] = 0
-        if sides[t] * keep < 0:
+        if sides[t] * keep[t] < 0:
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         size, axes = abs(sides[t]), close[a] & close[b] & close[c]
@@ -192,7 +192,7 @@ def spans_of(
         faces: (T, 3) of the proxy.
         beyond: (T, 3), see `sheets_loops.neighbours`.
         clip: (2, 4) near and far plane, positive on what is seen.
-        keep: sign of the determinants of triangles to keep; 0 keeps both.
+        keep: (T,) int8, the sign of the determinants of triangles that are kept; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         gap: see `Gaps`.
         by_row: see `Gaps`.
@@ -208,7 +208,7 @@ def spans_of(
     for i in range(first, last):
         t, count = triangles[i], begins[i]
         sign = corners_of(t, rows, vertices, faces, corners)
-        if not abs(sign) > 0 or sign * keep < 0:  # NaN, too.
+        if not abs(sign) > 0 or sign * keep[t] < 0:  # NaN, too.
             continue
         size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
         large = 0 if abs(size) < 2 * LARGE else 4  # Those that are seen in part, too.

@@ -8,13 +8,12 @@ from dataclasses import replace
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
-from rts.outlines.of_joint import sampled_fronts
+from rts.outlines.of_joint import AtOnce
 from rts.outlines.of_scene import with_outlines
 from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host, real_of
-from rts.sampling.joint import with_joints
 from rts.sampling.layer_count import has_full_stacks, with_all_layers
 from rts.sampling.merging import sampled_parts, without_hidden
 from rts.sampling.prepared import Prepared
@@ -87,8 +86,6 @@ def sampled_scene(
     apron, outlines = settings.apron, settings.finds_outlines
     grid = Grid.sampled(scene, camera, (height, width), apron)
     given, (scene, grid) = scene, on_the_host(scene, grid)
-    if scene.cameras and capacity is None and not settings.fronts:
-        scene = with_joints(scene, grid)
     told = settings.told([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.
     same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
@@ -98,23 +95,24 @@ def sampled_scene(
         sampled = sampled_by_one_call(scene, grid, request, layers, told)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=apron)
+    at_once, none = None, [False] * len(scene.parts)
+    if scene.cameras and capacity is None and not settings.fronts:
+        # Samples do not spread, so that what lies behind an opaque one has no effect.
+        at_once = AtOnce.of(scene, grid, scene.opaque if outlines else none)
 
     def taken(count: int) -> Sampled:
+        if at_once is not None:
+            return at_once.centres(count)
         if not outlines or capacity is not None:  # A capacity promises so many rows.
             return sampled_parts(scene, grid, request, count)
-        # Samples do not spread, so that what lies behind an opaque one has no effect.
         return without_hidden(sampled_parts(scene, grid, request, count, of_opaque=1), scene.opaque)
 
-    joint = scene.joints[0] if len(scene.joints) == 1 else None
-    if outlines and layers == 1 and capacity is None and joint is not None and len(joint.parts) == len(scene.parts):
-        sampled = sampled_fronts(joint, grid, told, same, real_of(scene))
-        if not settings.fronts:
-            sampled = replace(sampled, cells=replace(sampled.cells, triangle=None))
-        return in_engine(replace(sampled, supersample=factor, apron=apron), given) if not stays else sampled
     least = 1
     while True:
         sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)
-        if outlines:
+        if at_once is not None:
+            sampled = at_once.found(sampled, told if outlines else None, real_of(scene), same)
+        elif outlines:
             triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, told, capacity)
             sampled = sampled.replace(triangle=triangle) if settings.fronts else sampled
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):

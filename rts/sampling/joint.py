@@ -1,139 +1,145 @@
-"""Parts of triangles as one table, so that a sampler draws all at once: a single part, or neighbours of few triangles.
+"""Parts of triangles as one table, so that samples and outlines of all are found at once.
 
-Each part has samples of its own, behind one another: the table says which part a triangle belongs to. A neighbour costs
-a transform of its vertices, into the camera's space, and a call of its shader, but no pass over the image.
+Each part has samples of its own, behind one another: the table says which part a triangle belongs to. A part costs a
+transform of its vertices, into the camera's space, and a call of its shader; those of few triangles that are culled
+alike share a pass over the image, too.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
 from rts.sampling.sample_checks import check_fragments
-from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.scene import Grid, Scene
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-from rts.scene.transforms import determinant
 
 MOST = 2**15
-"""Triangles of a part that is joined to others: moving the vertices of a larger one costs more than a pass over the
-image."""
+"""Triangles of a part that is drawn along with others: a larger one costs more to prepare than a pass over the image."""
+
+
+class Draw(NamedTuple):
+    """What a sampler draws in one pass.
+
+    Attributes:
+        sampler: the sampler.
+        prepared: what it has prepared of the triangles.
+        camera: float64 matrices on the host, in the space of the triangles.
+        cull: of the triangles.
+        triangles: (T,) int32, their indices in the table of all; None where these are all, in order.
+    """
+
+    sampler: TriangleSampler
+    prepared: Any
+    camera: Camera
+    cull: str
+    triangles: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class Joint:
-    """The triangles of neighbouring parts.
+    """The triangles of all parts of a scene.
 
     Attributes:
-        scene: the scene.
-        first: the index of the first part.
+        parts: the parts.
         starts: (P + 1,) int32, where the triangles of each part begin.
         proxies: those of the parts, in their local spaces.
-        proxy: all triangles, in the space of `camera`; its `ids` are those of the parts.
+        proxy: all triangles, in the space of `camera`; its `ids` and `corner_params` are those of the parts, in tables
+            as wide as the widest.
         camera: float64 matrices on the host.
-        cull: of all parts.
-        sampler: of all parts.
-        prepared: the result of its `prepare` for all triangles.
+        signs: (T,) int8, `Camera.kept_sign` of triangles.
+        draws: the passes in which they are drawn.
     """
 
-    scene: Scene
-    first: int
+    parts: Sequence[CheckedPart]
     starts: np.ndarray
     proxies: Sequence[Proxy]
     proxy: Proxy
     camera: Camera
-    cull: str
-    sampler: TriangleSampler
-    prepared: Any
-
-    @property
-    def parts(self) -> Sequence[CheckedPart]:
-        """The parts."""
-        return self.scene.parts[self.first : self.stop]
-
-    @property
-    def stop(self) -> int:
-        """The index after that of the last part."""
-        return self.first + len(self.proxies)
+    signs: np.ndarray
+    draws: Sequence[Draw]
 
     @classmethod
-    def of(cls, scene: Scene, first: int, proxies: Sequence[Proxy], cameras: Sequence[Camera]) -> Joint:
-        """Join the parts from `first` on, given their proxies and the camera in the space of each, `Proxy.seen_by`."""
-        alike = all(np.array_equal(camera.view, cameras[0].view) for camera in cameras[1:])
-        vertices = [proxy.vertices for proxy in proxies]
-        if not alike:
-            vertices = [_moved(x, camera.view) for x, camera in zip(vertices, cameras, strict=True)]
-        camera = cameras[0] if alike else Camera(np.eye(4), cameras[0].projection)
-        return cls.seen_from(camera, scene, first, proxies, vertices)
+    def of(cls, scene: Scene, grid: Grid) -> Joint:
+        """The parts of a scene on the host, all of which are suited."""
+        proxies = [entry.proxy for entry in scene.entries]
+        cameras = [proxy.seen_by(scene.local_camera(i, grid)) for i, proxy in enumerate(proxies)]
+        vertices, camera = [proxy.vertices for proxy in proxies], cameras[0]
+        if not all(np.array_equal(other.view, camera.view) for other in cameras[1:]):
+            camera = Camera(np.eye(4), camera.projection)
+            vertices = [_moved(x, other.view) for x, other in zip(vertices, cameras, strict=True)]
+        return cls.seen_from(camera, scene, proxies, vertices, cameras)
 
     @classmethod
     def seen_from(
-        cls, camera: Camera, scene: Scene, first: int, proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]
+        cls,
+        camera: Camera,
+        scene: Scene,
+        proxies: Sequence[Proxy],
+        vertices: Sequence[np.ndarray],
+        cameras: Sequence[Camera],
     ) -> Joint:
-        """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
-        starts = np.array([0, *itertools.accumulate(len(proxy.faces) for proxy in proxies)], np.int32)
-        sampler, proxy = scene.samplers[first], proxies[0]
-        assert isinstance(sampler, TriangleSampler)
-        ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
-        if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
-            proxy, prepared = proxy._replace(ids=ids[0]), scene.entries[first].prepared
-        else:
-            shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
-            faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
-            params = [proxy.corner_params for proxy in proxies if proxy.corner_params is not None]
-            tables = np.concatenate(vertices), faces, np.concatenate(ids), np.concatenate(params) if params else None
-            proxy = Proxy(*tables)
-            prepared = sampler.prepare(proxy)
-        return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler, prepared)
-
-    def sampled(self, size: tuple[int, int], layers: int, triangles: bool, uniform: bool = False) -> Sampled:
-        """The samples at the centres of all cells; with `uniform` one sample stands for all cells of a part.
-
-        With `triangles` there are `Cells.triangle`, which count triangles over the parts.
-        """
-        grid = layers, *size
-        fragments = self.sampler.rasterize(self.prepared, self.camera, size, layers, self.cull)
-        covered = check_fragments(fragments, grid, len(self.proxy.faces), self.sampler)
-        sampled = self._of_one_row_each(fragments, covered) if uniform else self.lifted(fragments, covered)
-        return sampled if triangles else replace(sampled, cells=replace(sampled.cells, triangle=None))
-
-    def lifted(self, fragments: Fragments, covered: np.ndarray | None = None) -> Sampled:
-        """The samples of fragments (K, H, W), whose triangles are counted over the parts.
+        """The parts of a scene, given where their vertices are in the space of a camera.
 
         Args:
-            fragments: on the host.
-            covered: (K, H, W) bool, the cells in which there is one; None for all.
+            camera: the camera.
+            scene: the scene.
+            proxies: of its parts.
+            vertices: for each part (V, 3).
+            cameras: the camera in the space of each proxy.
         """
-        from rts.sampling import packing_loops
+        sizes = [len(proxy.faces) for proxy in proxies]
+        starts = np.array([0, *itertools.accumulate(sizes)], np.int32)
+        kept = [seen.kept_sign(part.cull) for part, seen in zip(scene.parts, cameras, strict=True)]
+        same = len(proxies) == 1 and vertices[0] is proxies[0].vertices  # Nothing moves, and nothing is copied.
+        proxy = proxies[0]._replace(ids=_ids(proxies[0])) if same else _in_one(proxies, vertices)
+        signs = np.array(kept, np.int8).repeat(sizes)
+        groups: dict[Any, list[int]] = {}
+        for i, part in enumerate(scene.parts):
+            alone = sizes[i] > MOST or kept[i] != camera.kept_sign(part.cull)
+            if sizes[i]:
+                groups.setdefault(i if alone else (part.cull, id(scene.samplers[i])), []).append(i)
+        draws = []
+        for group in groups.values():
+            first, cull, whole = group[0], scene.parts[group[0]].cull, len(group) == sum(map(bool, sizes))
+            sampler, own = scene.samplers[first], (cameras[first], scene.entries[first].prepared)
+            assert isinstance(sampler, TriangleSampler)
+            if len(group) > 1 or own[1] is None:
+                several = proxy if whole else _in_one([proxies[i] for i in group], [vertices[i] for i in group])
+                own = camera, sampler.prepare(several)
+            triangles = [np.arange(starts[i], starts[i + 1], dtype=np.int32) for i in group]
+            draws.append(Draw(sampler, own[1], own[0], cull, None if whole else np.concatenate(triangles)))
+        return cls(scene.parts, starts, proxies, proxy, camera, signs, draws)
 
-        ids, proxy = fragments.triangle_ids, self.proxy
-        covered = ids >= 0 if covered is None else covered
-        assert proxy.ids is not None
-        counts, ids_of_parts, params, row, depth, _ = packing_loops.pack(
-            fragments, covered, proxy.ids, proxy.corner_params, starts=self.starts
-        )
-        return self.of_parts(counts, ids_of_parts, params, Cells(row, depth, ids))
+    def drawn(self, size: tuple[int, int], layers: int) -> Fragments:
+        """The fragments (K, H, W) at the centres of cells, whose triangles are counted over the parts."""
+        from rts.sampling import merging_loops
 
-    def _of_one_row_each(self, fragments: Fragments, covered: np.ndarray) -> Sampled:
-        """Samples of fragments (K, H, W) of which one, at the first of its cells, stands for all cells of a part."""
-        from rts.sampling import packing_loops
-
-        row, first = packing_loops.parts_of(fragments.triangle_ids, covered, self.starts)
-        table, seen = self.proxy, first[first >= 0]
-        assert table.ids is not None
-        one = Fragments(*[x.reshape(1, 1, row.size, *x.shape[3:])[:, :, seen] for x in fragments])
-        known = np.ones((1, 1, len(seen)), np.bool_), table.ids, table.corner_params
-        counts, ids, params, *_ = packing_loops.pack(one, *known, starts=self.starts)
-        depth = np.where(covered, fragments.depth, np.float32(0))
-        return self.of_parts(counts, ids, params, Cells(row, depth, fragments.triangle_ids))
+        passes, shape = [], (layers, *size)
+        for sampler, prepared, camera, cull, triangles in self.draws:
+            count = len(self.proxy.faces) if triangles is None else len(triangles)
+            fragments = sampler.rasterize(prepared, camera, size, layers, cull)
+            check_fragments(fragments, shape, count, sampler)
+            ids, shares, depth = (read_only(x, y) for x, y in zip(fragments, _DTYPES, strict=True))
+            if triangles is not None:  # −1 takes the last.
+                ids = read_only(np.append(triangles, np.int32(-1)).take(ids))
+            passes.append(Fragments(ids, shares, depth))
+        if len(passes) == 1:
+            return passes[0]
+        merged = Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
+        for fragments in passes:
+            parallel(merging_loops.insert_fragments, size[0], *fragments, *merged, work=5 * merged.depth.size)
+        return merged
 
     def of_parts(self, counts: np.ndarray, ids: np.ndarray, params: np.ndarray, cells: Cells) -> Sampled:
         """The samples of a table, part after part, of which those with a count (P,) of 0 have one unused row.
@@ -141,53 +147,49 @@ class Joint:
         A single part has the cells of the image; several have a cell for each row.
         """
         samples, none, stop = [], np.zeros((), np.int32), 0
-        for part, count in zip(self.parts, counts.tolist(), strict=True):
+        for part, proxy, count in zip(self.parts, self.proxies, counts.tolist(), strict=True):
             start, stop = stop, stop + max(count, 1)
             if len(counts) == 1:
                 own = Cells(cells.row, cells.depth)
             else:
                 own = Cells(np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count))
-            samples.append(Samples(ids[start:stop], params[start:stop], own, none, gbuffer_names=part.reads))
+            i, p = _ids(proxy).shape[1], 2 if proxy.corner_params is None else proxy.corner_params.shape[2]
+            tables = (np.ascontiguousarray(x[start:stop, :width]) for x, width in ((ids, i), (params, p)))
+            samples.append(Samples(*tables, own, none, gbuffer_names=part.reads))
         return Sampled(tuple(samples), cells, none)
 
 
-def with_joints(scene: Scene, grid: Grid) -> Scene:
-    """A scene on the host with its `joints`: single parts, and neighbours that can be sampled at once.
-
-    These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
-    """
-    suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
-    if not all(suited) and not (any(suited) and all(map(has_sheets, scene.parts, scene.samplers))):
-        return scene
-    joints = []
-    runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))
-    for (suits, *_), run in runs:
-        if suits:
-            joints += _joined(scene, grid, list(run))
-    return scene._replace(joints=tuple(joints))
+_DTYPES = np.int32, np.float32, np.float32
 
 
-def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
-    """Joints of some neighbouring parts: of few triangles, alike in their tables, and not both culled and mirrored.
+def _ids(proxy: Proxy) -> np.ndarray:
+    """The ids (T, I) of a proxy's triangles."""
+    return proxy.faces if proxy.ids is None else proxy.ids
 
-    Others, but for those without triangles, are joints of their own.
-    """
-    proxies, cameras = {}, {}
-    for index in indices:
-        proxies[index] = scene.entries[index].proxy
-        cameras[index] = proxies[index].seen_by(scene.local_camera(index, grid))
 
-    def kind(index: int) -> tuple:
-        proxy = proxies[index]
-        mirrored = scene.parts[index].cull == "back" and determinant(cameras[index].view) < 0
-        tables = (None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params))
-        return 0 < len(proxy.faces) <= MOST and not mirrored, *tables
+def _in_one(proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]) -> Proxy:
+    """Several proxies as one, whose vertices are given; tables are as wide as the widest, filled up with 0."""
+    shifts = itertools.accumulate(map(len, vertices), initial=0)
+    faces = np.concatenate([proxy.faces + np.int32(shift) for proxy, shift in zip(proxies, shifts, strict=False)])
+    params = None
+    if any(proxy.corner_params is not None for proxy in proxies):
+        params = [
+            _BARYCENTRICS.repeat(len(proxy.faces), 0) if proxy.corner_params is None else proxy.corner_params
+            for proxy in proxies
+        ]
+    return Proxy(np.concatenate(vertices), faces, _wide(list(map(_ids, proxies))), params and _wide(params))
 
-    groups = [((False,), indices)] if len(indices) == 1 else itertools.groupby(indices, kind)
-    for (joins, *_), run in groups:
-        numbers = list(run)
-        for several in [numbers] if joins else [[number] for number in numbers if len(proxies[number].faces)]:
-            yield Joint.of(scene, several[0], [proxies[i] for i in several], [cameras[i] for i in several])
+
+_BARYCENTRICS = np.array([[[1, 0], [0, 1], [0, 0]]], np.float32)
+"""The parameters of corners that are interpolated to the first two barycentrics."""
+
+
+def _wide(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Several tables (N, ..., Q) as one, as wide as the widest."""
+    most = max(x.shape[-1] for x in tables)
+    return np.concatenate(
+        [x if x.shape[-1] == most else np.pad(x, [*[(0, 0)] * (x.ndim - 1), (0, most - x.shape[-1])]) for x in tables]
+    )
 
 
 def is_suited(part: CheckedPart, sampler: object) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,20 +27,13 @@ def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, of_op
         layers: K.
         of_opaque: the most layers to take of an opaque part; None for K.
     """
-    tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
-    of_parts = [min(of_opaque or layers, layers) if opaque else layers for opaque in scene.opaque]
-    while number < len(scene.parts):
-        joint = joints.get(number)
-        if joint is not None:
-            first, number = number, joint.stop
-            most = max(of_parts[first:number])  # They are drawn at once.
-            tables.append(joint.sampled(grid.size, most, request.triangles, request.uniform))
-            continue
-        part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
-        camera = scene.local_camera(number, grid)
-        sampled = sampler.sample(part, camera, grid.size, of_parts[number], replace(request, entry=entry))
+    tables = []
+    parts = zip(scene.parts, scene.samplers, scene.entries, scene.opaque, strict=True)
+    for number, (part, sampler, entry, opaque) in enumerate(parts):
+        most = min(of_opaque or layers, layers) if opaque else layers
+        camera, asked = scene.local_camera(number, grid), replace(request, entry=entry)
+        sampled = sampler.sample(part, camera, grid.size, most, asked)
         tables.append(check_samples(sampled, grid.size, sampler))
-        number += 1
     return merge(tables, layers)
 
 
@@ -102,13 +94,13 @@ def _with_rows(samples: Samples, index: np.ndarray, place: np.ndarray) -> Sample
     return samples.replace(row=engine.constant(place[row], samples.row))
 
 
-def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:
+def merge(tables: Sequence[Samples], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
 
     A single table keeps its cells as they are. The result has fewer layers if all tables together have fewer.
 
     Args:
-        tables: the samples of each part, or of neighbouring parts that were sampled at once.
+        tables: the samples of each part.
         layers: K.
 
     Raises:
@@ -117,11 +109,10 @@ def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:
     overflow = tables[0].overflow
     for own in tables[1:]:
         overflow = overflow + own.overflow
-    parts = [table.samples if isinstance(table, Sampled) else (table,) for table in tables]
-    samples = tuple(itertools.chain(*parts))
+    samples = tuple(tables)
     if len(tables) == 1:
         return Sampled(samples, tables[0].cells, overflow)
-    sizes = tuple(sum(own.ids.shape[0] for own in several) for several in parts)
+    sizes = tuple(own.ids.shape[0] for own in tables)
     arrays = [*(own.row for own in tables), *(own.depth for own in tables)]
     if all(own.triangle is not None for own in tables):
         arrays += [own.triangle for own in tables]

@@ -133,3 +133,37 @@ def _keep(start, stop, seen, place, row, depth, triangle):
                 depth[k, y, x] = depth[k, y, x] if there else 0
             for x in range(row.shape[2] if len(triangle) else 0):
                 triangle[k, y, x] = triangle[k, y, x] if seen[k, y, x] else -1
+
+
+@loop
+def insert_fragments(start, stop, more, more_shares, more_depths, triangles, shares, depths):
+    """Insert fragments into lines [start, stop) of others, by depth, and of equal ones by triangle.
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        more: (K, H, W) int32, the triangles to insert, front to back; −1 for none.
+        more_shares: (K, H, W, 2) float32.
+        more_depths: (K, H, W) float32.
+        triangles: (K, H, W) int32, those to insert them into; −1 in empty layers, which are the last ones.
+        shares: (K, H, W, 2) float32.
+        depths: (K, H, W) float32.
+    """
+    layers = len(triangles)
+    for y in range(start, stop):
+        for x in range(triangles.shape[2]):
+            k = 0
+            for n in range(layers):
+                t, z = more[n, y, x], more_depths[n, y, x]
+                if t < 0:
+                    break
+                while k < layers and 0 <= triangles[k, y, x] and (depths[k, y, x], triangles[k, y, x]) < (z, t):
+                    k += 1
+                if k == layers:
+                    break
+                for m in range(layers - 1, k, -1):
+                    triangles[m, y, x], depths[m, y, x] = triangles[m - 1, y, x], depths[m - 1, y, x]
+                    shares[m, y, x, 0], shares[m, y, x, 1] = shares[m - 1, y, x, 0], shares[m - 1, y, x, 1]
+                triangles[k, y, x], depths[k, y, x] = t, z
+                shares[k, y, x, 0], shares[k, y, x, 1] = more_shares[n, y, x, 0], more_shares[n, y, x, 1]
+                k += 1

@@ -58,8 +58,8 @@ def pack(
     ids, params = make((total, table.shape[1]), np.int32), make((total, width), np.float32)
     if len(table) and not capacity and 0 in counts.tolist():
         for part in np.flatnonzero(counts == 0):
-            triangle = 0 if starts is None else starts[part]
-            ids[firsts[part]], params[firsts[part]] = middle_of(table, corner_params, triangle)
+            triangle, stop = (0, len(table)) if starts is None else starts[part : part + 2]
+            ids[firsts[part]], params[firsts[part]] = middle_of(table[:stop], corner_params, triangle)
     known = owners, table, corners, ids, params
     parallel(_pack, pieces, bounds, ahead, *cells, *known, row.reshape(-1), depth.reshape(-1), work=8 * count)
     _pack(0, 1, of_more, last, *others, *known, rows, depths)
@@ -86,35 +86,26 @@ def _listed(fragments: Fragments, kept: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def middle_of(table: np.ndarray, corner_params: np.ndarray | None, triangle: int) -> tuple[np.ndarray, Any]:
-    """Ids (I,) and params (P,) of the middle of a triangle, for a row that no cell names, but shaders see."""
+    """Ids (I,) and params (P,) of the middle of a triangle, for a row that no cell names, but shaders see.
+
+    Zeros if the table has no such triangle.
+    """
+    if triangle >= len(table):
+        return np.zeros(table.shape[1], np.int32), 0.0
     return table[triangle], 1 / 3 if corner_params is None else corner_params[triangle].mean(axis=0)
 
 
-def parts_of(triangles: np.ndarray, covered: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part (K, H, W) int32 of each cell, −1 where it is not covered, and the first cell (P,) of each part, or −1.
-
-    Args:
-        triangles: (K, H, W), counted over all parts.
-        covered: (K, H, W) bool, the cells in which there is one.
-        starts: (P + 1,) int32, where the triangles of each part begin.
-    """
-    if len(starts) == 2:
-        at = int(covered.argmax())
-        return covered.view(np.int8) - np.int32(1), np.array([at if covered.reshape(-1)[at] else -1])
-    part_of = owners_of(starts)
-    row, first = np.empty(covered.shape, np.int32), np.full(len(starts) - 1, -1, np.int64)
-    triangles, there = read_only(triangles, np.int32).reshape(-1), read_only(covered).reshape(-1)
-    _parts_of(triangles, there, part_of, row.reshape(-1), first)
-    return row, first
-
-
 @loop
-def _parts_of(triangles, there, part_of, row, first):
-    """Fill `row` (M,) and `first` (P,), given as −1; see `parts_of`."""
-    for m in range(len(row)):
-        row[m] = part_of[triangles[m]] if there[m] else -1
-        if there[m] and first[row[m]] < 0:
-            first[row[m]] = m
+def firsts_of(part, count):
+    """(P,) int64: the first cell of each of `count` parts, among those seen in cells (K, H, W), or −1."""
+    first, left, cells = np.full(count, -1), count, part.reshape(-1)
+    for m in range(len(cells)):
+        if left == 0:
+            break
+        if cells[m] >= 0 and first[cells[m]] < 0:
+            first[cells[m]] = m
+            left -= 1
+    return first
 
 
 @loop

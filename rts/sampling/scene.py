@@ -34,7 +34,6 @@ class Scene(NamedTuple):
         entries: the structure that each sampler has built for its part, or None.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
         cameras: the camera of the grid in the local space of each part, where it is known already.
-        joints: neighbouring parts that are sampled at once; see `rts.sampling.joint`.
     """
 
     parts: list[CheckedPart]
@@ -43,7 +42,6 @@ class Scene(NamedTuple):
     entries: Sequence[Any]
     context: Context
     cameras: Sequence[Camera] = ()
-    joints: Sequence[Any] = ()
 
     @property
     def channels(self) -> int:

@@ -92,10 +92,8 @@ def _is_inside(seen: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
     return bool(whole and (np.abs(seen[:, :2]) <= limits * w[:, None]).all())
 
 
-def joined(views: Sequence[DrawnView], picture: Picture) -> tuple[Scene, Grid]:
-    """One scene of all parts, view after view, and the cells of the picture; its one `Joint` has all parts.
-
-    The scene's parts have no transforms: only the joint tells where they are.
+def joined(views: Sequence[DrawnView], picture: Picture) -> tuple[Scene, Grid, Joint]:
+    """One scene of all parts, view after view; the cells of the picture; and where parts are, which have no transforms.
 
     Args:
         views: views of one kind.
@@ -122,4 +120,5 @@ def joined(views: Sequence[DrawnView], picture: Picture) -> tuple[Scene, Grid]:
         [Entry(proxy, None) for proxy in proxies],
         scenes[0].context,
     )
-    return whole._replace(joints=(Joint.seen_from(camera, whole, 0, proxies, vertices),)), Grid(camera, picture.size)
+    joint = Joint.seen_from(camera, whole, proxies, vertices, [camera] * len(proxies))
+    return whole, Grid(camera, picture.size), joint

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, namespace
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Cells, Sampled, Samples
-from rts.outlines.of_scene import with_outlines
+from rts.outlines.of_joint import AtOnce
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, real_of
 from rts.sampling.picture import Picture
@@ -22,15 +22,13 @@ from rts.views.sampled_views import Views, with_counts
 
 def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: RenderSettings) -> Views:
     """The samples of views of one kind, and their outlines if the splatter reads these."""
-    scene, grid = joined(views, picture)
+    scene, grid, joint = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
     outlines, layers, told = settings.finds_outlines, settings.most_layers, settings.told([x.scene for x in views])
     same = not told.colors and outlines and layers == 1 and not settings.fronts
-    sampled = scene.joints[0].sampled(picture.size, layers, outlines, same)
-    if outlines:
-        here = Context(engine_of(), np.zeros((), real_of(scene)))
-        sampled = with_outlines(sampled, scene._replace(context=here), grid, told)
+    at_once = AtOnce(joint, grid, scene.opaque if outlines else [False] * len(scene.parts))
+    sampled = at_once.found(at_once.centres(layers), told if outlines else None, real_of(scene), same)
     sampled = in_engine(sampled, scene)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
     return _by_place(sampled, picture, [len(view.proxies) for view in views])

@@ -1,0 +1,95 @@
+"""Breaks of a scene, as many as there is room for, and the samples beside them that tell colours and motions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.errors import InputWarning, warn
+from rts.outlines.found import Told
+from rts.outlines.gaps import Breaks, Fronts, Stacks
+from rts.outlines.sheets import Sheets
+from rts.outlines.spans import breaks_of_triangles
+from rts.outlines.stacks import breaks_of_stacks
+
+
+class Beside(NamedTuple):
+    """The M samples that outlines need beside breaks. Host arrays.
+
+    Attributes:
+        place: (M,) int, places in `Outlines.rows`, (B, columns).
+        part: (M,) int32, the parts of samples.
+        triangle: (M,) int32, on which they lie; −1 where none is known.
+        points: (M, 2), where they are.
+        number: (M,) int32, how many layers of the same part are in front; 0 where triangles are known.
+        columns: the number of columns of `Outlines.rows`.
+    """
+
+    place: np.ndarray
+    part: np.ndarray
+    triangle: np.ndarray
+    points: np.ndarray
+    number: np.ndarray
+    columns: int
+
+    @classmethod
+    def of(cls, breaks: Breaks, stacks: Stacks | None, told: Told) -> Beside:
+        """The samples that stand for `told` beside breaks of one layer, or that stacks have there."""
+        from rts.outlines import samples_loops
+
+        if stacks is not None:
+            parts = np.concatenate([stacks.last, stacks.parts], 1)
+            (place,) = (parts.reshape(-1) >= 0).nonzero()
+            triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
+            points = np.concatenate([breaks.points, stacks.points], 1)
+            arrays = (x.reshape(-1).take(place) for x in (parts, triangles))
+            return cls(place, *arrays, points.reshape(-1, 2)[place], stacks.numbers.reshape(-1)[place], parts.shape[1])
+        most = 4 * len(breaks.gap)
+        place, part, triangle = np.empty((3, most), np.int32)
+        points = np.empty((most, 2))
+        of_breaks = breaks.parts, breaks.ends, breaks.points, breaks.inner, breaks.triangles
+        count = samples_loops.needed(*of_breaks, *told, place, part, triangle, points)
+        return cls(place[:count], part[:count], triangle[:count], points[:count], np.zeros(count, np.int32), 6)
+
+    def table(self, breaks: int, values: np.ndarray) -> np.ndarray:
+        """A table (B, columns) int32 with a value (M,) for each sample; else −1."""
+        table = np.full((breaks, self.columns), -1, np.int32)
+        table.reshape(-1)[self.place] = values
+        return table
+
+
+def breaks_of_sheets(
+    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray, seams: bool
+) -> tuple[Breaks, Stacks | None]:
+    """The breaks between what is seen at centres (K, H, W); of several layers, nothing behind an opaque one."""
+    if len(layers.part) == 1:
+        return breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, width, seams), None
+    return breaks_of_stacks(layers, opaque, sheets, width, seams)
+
+
+def limited(
+    find: Callable[[bool], tuple[Breaks, Stacks | None]], most: int | None, seams: bool
+) -> tuple[Breaks, Stacks | None, int]:
+    """The breaks that `find` gives, and their stacks, at most so many; and the number of those left out.
+
+    `find` takes whether there are breaks at seams, which are left out before outlines are; `seams` is what is wanted.
+
+    Warns:
+        InputWarning: some are left out.
+    """
+    breaks, stacks = find(seams)
+    count = len(breaks.gap)
+    if most is None or count <= most:
+        return breaks, stacks, 0
+    if seams:
+        breaks, stacks = find(False)
+    left = count - min(most, len(breaks.gap))
+    warn(
+        f"{left} breaks of outlines find no room beside {most}, and edges there neither move nor are smooth; "
+        f"give the compiled program capacity={4 * count} or more",
+        InputWarning,
+    )
+    breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
+    return breaks, stacks if stacks is None else Stacks(*(x[:most] for x in stacks)), left
