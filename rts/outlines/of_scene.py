@@ -32,7 +32,6 @@ def with_outlines(
     grid: Grid,
     told: Told,
     capacity: int | None = None,
-    most: int | None = None,
 ) -> Sampled:
     """Samples at cells' centres with `Sampled.stencil` and the samples beside breaks.
 
@@ -45,7 +44,6 @@ def with_outlines(
         told: what samples beside breaks have to tell.
         capacity: `Request.capacity`. Where values are traced, there is room for `most_breaks`, or for fewer if a shared
             table has no room for their samples. `overflow` counts those beyond.
-        most: the most breaks to find where values are known; None for all.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
@@ -64,17 +62,11 @@ def with_outlines(
     if traced or any(map(is_batched, leaves(inputs))):
         room = most_breaks(grid, capacity) if traced else None
         return _found_on_host(sampled, scene, grid, room, capacity, told, inputs)
-    points, count = Points.of(scene, grid, inputs_of(scene), told), most
-    cells = map_leaves(host_value, sampled.cells)
-    centres = at_centres(cells, sampled.samples)
-    while True:
-        found, parts, more = points.outlines(centres, count)
-        samples, places = _joined(sampled.samples, more, _used(found.rows, parts, len(more)))
-        row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
-        stencil = _over_parts(found, parts, places.beside).stencil(row, told, real)
-        if fits(stencil, most) or not count:
-            break
-        count = min(count, len(found.place)) // 2
+    points, cells = Points.of(scene, grid, inputs_of(scene), told), map_leaves(host_value, sampled.cells)
+    found, parts, more = points.outlines(at_centres(cells, sampled.samples))
+    samples, places = _joined(sampled.samples, more, _used(found.rows, parts, len(more)))
+    row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
+    stencil = _over_parts(found, parts, places.beside).stencil(row, told, real)
     if len(samples) > 1:
         row = engine_of(sampled.row).constant(row, sampled.row)
         sampled = replace(sampled, cells=replace(sampled.cells, row=row))

@@ -23,7 +23,6 @@ from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.sampling.camera_checks import on_host
 from rts.sampling.entries import entry_of
-from rts.sampling.packing import pack_fragments
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -178,10 +177,6 @@ class Points:
     ) -> Samples:
         """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         (sampler, camera, entry, sheets), checked = self._parts[part], self._scene.parts[part]
-        plain = sheets is not None and not _refines(checked) and checked.surface.centered
-        if fragments is not None and plain and not pairs and not self._scene.context.engine.differentiates:
-            # What a call of the sampler comes to.
-            return pack_fragments(fragments, entry.proxy).replace(gbuffer_names=checked.reads, at_points=True)
         if fragments is None and len(points):
             # Engines that compile eager operations for each shape get few: further rows repeat the first point.
             arrays = checked.theta, camera

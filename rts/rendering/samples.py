@@ -15,7 +15,7 @@ from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host, real_of
 from rts.sampling.layer_count import has_full_stacks, with_all_layers
-from rts.sampling.merging import sampled_parts, without_hidden
+from rts.sampling.merging import sampled_parts
 from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
@@ -103,9 +103,7 @@ def sampled_scene(
     def taken(count: int) -> Sampled:
         if at_once is not None:
             return at_once.centres(count)
-        if not outlines or capacity is not None:  # A capacity promises so many rows.
-            return sampled_parts(scene, grid, request, count)
-        return without_hidden(sampled_parts(scene, grid, request, count, of_opaque=1), scene.opaque)
+        return sampled_parts(scene, grid, request, count, 1 if outlines and capacity is None else None)
 
     least = 1
     while True:

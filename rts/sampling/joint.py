@@ -25,7 +25,8 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 MOST = 2**15
-"""Triangles of a part that is drawn along with others: a larger one costs more to prepare than a pass over the image."""
+"""Triangles of a part that is drawn along with others: a larger one takes longer to prepare than a pass over the image.
+"""
 
 
 class Draw(NamedTuple):
@@ -106,7 +107,7 @@ class Joint:
         signs = np.array(kept, np.int8).repeat(sizes)
         groups: dict[Any, list[int]] = {}
         for i, part in enumerate(scene.parts):
-            alone = sizes[i] > MOST or kept[i] != camera.kept_sign(part.cull)
+            alone = sizes[i] > MOST or not joins(scene.samplers[i]) or kept[i] != camera.kept_sign(part.cull)
             if sizes[i]:
                 groups.setdefault(i if alone else (part.cull, id(scene.samplers[i])), []).append(i)
         draws = []
@@ -197,8 +198,13 @@ def is_suited(part: CheckedPart, sampler: object) -> bool:
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
         return False
-    joins = sampler.joins_parts and sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
-    return joins and surface.centered and not surface.refines and not surface.depends_on_view
+    draws = sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
+    return draws and surface.centered and not surface.refines and not surface.depends_on_view
+
+
+def joins(sampler: object) -> bool:
+    """True if a sampler of triangles draws those of several parts in one pass."""
+    return isinstance(sampler, TriangleSampler) and sampler.joins_parts
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:

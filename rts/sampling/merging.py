@@ -8,13 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace, value_of
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples
 from rts.errors import InputError
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.tables import taken_rows
 
 
 def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, of_opaque: int | None = None) -> Sampled:
@@ -35,63 +34,6 @@ def sampled_parts(scene: Scene, grid: Grid, request: Request, layers: int, of_op
         sampled = sampler.sample(part, camera, grid.size, most, asked)
         tables.append(check_samples(sampled, grid.size, sampler))
     return merge(tables, layers)
-
-
-def without_hidden(sampled: Sampled, opaque: Sequence[bool]) -> Sampled:
-    """Samples without those that lie behind one of an opaque part in their cell.
-
-    Only values that are known, on the host, tell. Engines that pad keep the rows, and no cell refers to them.
-
-    Args:
-        sampled: the samples.
-        opaque: for each part, whether no light passes through it.
-    """
-    from rts.sampling import merging_loops
-
-    if not any(opaque) or sampled.row.shape[-3] == 1:
-        return sampled
-    engine, row = engine_of(sampled.row), sampled.row
-    known = value_of(row) if engine.on_host(row) else None
-    if known is None or known.ndim != row.ndim:
-        return sampled
-    counts = [one.ids.shape[0] for one in sampled.samples]
-    seen, used = merging_loops.seen_along_rays(known, np.repeat(opaque, counts))
-    if np.array_equal(seen, known >= 0):
-        return sampled
-    samples, place, first, start = [], np.full(len(used), -1, np.int32), 0, 0
-    for one, count in zip(sampled.samples, counts, strict=True):
-        in_use = used[first : first + count]
-        index = np.arange(count) if engine.padded(row) else np.flatnonzero(in_use)
-        index = index if len(index) else np.zeros(1, int)  # A part that nobody sees has one unused row.
-        own = np.full(count + 1, -1, np.int32)
-        own[index] = np.where(in_use[index], np.arange(len(index)), -1)
-        place[first : first + count] = own[:-1] + start
-        samples.append(_with_rows(one, index, own))
-        first, start = first + count, start + len(index)
-    of_cells = [row, sampled.depth, sampled.cells.first(0).row if sampled.triangle is None else sampled.triangle]
-    known = [np.array(value_of(x)) for x in of_cells]
-    merging_loops.keep(seen, place, *known)
-    cells = [engine.constant(x, like) for x, like in zip(known, of_cells, strict=True)]
-    cells = Cells(*(cells[:2] if sampled.triangle is None else cells))
-    return replace(sampled, samples=tuple(samples), cells=cells)
-
-
-def _with_rows(samples: Samples, index: np.ndarray, place: np.ndarray) -> Samples:
-    """The rows of samples with some indices.
-
-    Args:
-        samples: the samples of a part.
-        index: the rows to keep.
-        place: (N + 1,), the new index of each old row, or −1 if it is dropped; −1 in last place, which −1 refers to.
-    """
-    engine, count, row = engine_of(samples.ids), samples.ids.shape[0], value_of(samples.row)
-    assert row is not None
-    # Parts that were sampled at once have a cell for each sample; grids with an apron are taller than a line.
-    if row.shape[-2:] == (1, count):
-        row = row[..., index]
-    if len(index) < count:
-        samples = taken_rows(samples, engine.constant(index.astype(np.int32), samples.ids))
-    return samples.replace(row=engine.constant(place[row], samples.row))
 
 
 def merge(tables: Sequence[Samples], layers: int) -> Sampled:

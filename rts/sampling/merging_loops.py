@@ -84,57 +84,6 @@ def _put(index, z, t, y, x, k, row, depth, triangle):
     return k
 
 
-def seen_along_rays(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The samples (K, H, W) that rays meet before they end, and the rows (N,) that these have; both bool.
-
-    Args:
-        row: (K, H, W), front to back, or −1.
-        blocks: (N,) bool, whether rays end at a sample.
-    """
-    seen, used = np.empty(row.shape, np.bool_), np.zeros(len(blocks), np.bool_)
-    parallel(_look, row.shape[1], read_only(row, np.int32), read_only(blocks), seen, used, work=3 * row.size)
-    return seen, used
-
-
-@loop
-def _look(start, stop, row, blocks, seen, used):
-    """Fill lines of `seen`, and mark rows as `used`."""
-    for y in range(start, stop):
-        for x in range(row.shape[2]):
-            goes_on = True
-            for k in range(len(row)):
-                n = row[k, y, x]
-                seen[k, y, x] = goes_on and n >= 0
-                if seen[k, y, x]:
-                    used[n], goes_on = True, not blocks[n]
-
-
-def keep(seen: np.ndarray, place: np.ndarray, row: np.ndarray, depth: np.ndarray, triangle: np.ndarray) -> None:
-    """Empty the cells whose sample is not seen, and renumber the other rows; all but `seen` and `place` are changed.
-
-    Args:
-        seen: (K, H, W) bool.
-        place: (N,) int32, the new index of each row.
-        row: (K, H, W) int32, or −1.
-        depth: (K, H, W) of the samples; 0 where there is none.
-        triangle: (K, H, W) int32, likewise, −1 where there is none; or (0, H, W).
-    """
-    parallel(_keep, row.shape[1], seen, read_only(place), row, depth, triangle, work=4 * row.size)
-
-
-@loop
-def _keep(start, stop, seen, place, row, depth, triangle):
-    """`keep`, of some lines."""
-    for k in range(len(row)):
-        for y in range(start, stop):
-            for x in range(row.shape[2]):
-                there = seen[k, y, x]
-                row[k, y, x] = place[row[k, y, x]] if there else -1
-                depth[k, y, x] = depth[k, y, x] if there else 0
-            for x in range(row.shape[2] if len(triangle) else 0):
-                triangle[k, y, x] = triangle[k, y, x] if seen[k, y, x] else -1
-
-
 @loop
 def insert_fragments(start, stop, more, more_shares, more_depths, triangles, shares, depths):
     """Insert fragments into lines [start, stop) of others, by depth, and of equal ones by triangle.

@@ -16,7 +16,7 @@ from rts.contracts.records import Proxy
 from rts.sampling.cache import Entry
 from rts.sampling.camera_checks import check_camera
 from rts.sampling.host_scenes import on_the_host
-from rts.sampling.joint import MOST, Joint, is_suited
+from rts.sampling.joint import MOST, Joint, is_suited, joins
 from rts.sampling.picture import Picture
 from rts.sampling.points import pixel_widths
 from rts.sampling.scene import Grid, Scene
@@ -54,7 +54,7 @@ class DrawnView(NamedTuple):
         """
         sampler, cull = scene.samplers[0], scene.parts[0].cull
         for part, chosen_sampler in zip(scene.parts, scene.samplers, strict=True):
-            if chosen_sampler is not sampler or part.cull != cull or not is_suited(part, chosen_sampler):
+            if chosen_sampler is not sampler or part.cull != cull or not (is_suited(part, sampler) and joins(sampler)):
                 return None
         here, cells = on_the_host(scene, grid)
         if not here.cameras:

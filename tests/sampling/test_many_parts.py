@@ -67,14 +67,16 @@ def image_of(parts, **options):
 
 def kinds_of(parts, **options):
     """For each part, whether a pass of the sampler draws it along with others."""
-    together, of = set(), joint.Joint.of
+    together, drawn = set(), joint.Joint.drawn
 
-    def noted(scene, first, proxies, cameras):
-        if len(proxies) > 1:
-            together.update(range(first, first + len(proxies)))
-        return of(scene, first, proxies, cameras)
+    def noted(self, size, layers):
+        for draw in self.draws:
+            triangles = np.arange(self.starts[-1]) if draw.triangles is None else draw.triangles
+            several = set(np.searchsorted(self.starts, triangles, side="right") - 1)
+            together.update(several if len(several) > 1 else ())
+        return drawn(self, size, layers)
 
-    with mock.patch.object(joint.Joint, "of", noted):
+    with mock.patch.object(joint.Joint, "drawn", noted):
         rts.sample(parts, CAMERA, SIZE, engine="torch", **options)
     return [index in together for index in range(len(parts))]
 
@@ -131,7 +133,7 @@ def test_mirrored_and_large_parts_and_those_of_other_samplers_are_drawn_alone(si
     assert kinds_of(own) == [True, True, False, True, True, True]
     np.testing.assert_allclose(image_of(own), singly(image_of, own), rtol=0, atol=1e-5)
     monkeypatch.setattr(joint, "MOST", 30)
-    assert kinds_of(own) == [False, False, False, False, True, True]
+    assert kinds_of(own) == [False, True, False, False, True, True]
 
 
 @pytest.mark.parametrize("mirrors", ["parts", "camera"])
