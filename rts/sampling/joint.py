@@ -21,7 +21,7 @@ from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler, rasterized
 from rts.scene.camera import Camera
 
 MOST = 2**15
@@ -129,7 +129,7 @@ class Joint:
         passes, shape = [], (layers, *size)
         for sampler, prepared, camera, cull, triangles in self.draws:
             count = len(self.proxy.faces) if triangles is None else len(triangles)
-            fragments = sampler.rasterize(prepared, camera, size, layers, cull)
+            fragments = rasterized(sampler, prepared, camera, size, layers, cull)
             check_fragments(fragments, shape, count, sampler)
             ids, shares, depth = (read_only(x, y) for x, y in zip(fragments, _DTYPES, strict=True))
             if triangles is not None:  # −1 takes the last.
@@ -198,13 +198,13 @@ def is_suited(part: CheckedPart, sampler: object) -> bool:
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
         return False
-    draws = sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
-    return draws and surface.centered and not surface.refines and not surface.depends_on_view
+    own = overrides(sampler, "sample", TriangleSampler) or overrides(sampler, "update", TriangleSampler)
+    return not own and surface.centered and not surface.refines and not surface.depends_on_view
 
 
 def joins(sampler: object) -> bool:
     """True if a sampler of triangles draws those of several parts in one pass."""
-    return isinstance(sampler, TriangleSampler) and sampler.joins_parts
+    return isinstance(sampler, TriangleSampler) and sampler.joins_parts and sampler.concurrent
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
@@ -229,6 +230,14 @@ class TriangleSampler(Sampler):
     def draws_at_once(self) -> bool:
         """True if several threads may draw one prepared entry at once."""
         return self.concurrent and not overrides(self, "update", TriangleSampler)
+
+
+def rasterized(
+    sampler: TriangleSampler, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str
+) -> Fragments:
+    """`TriangleSampler.rasterize`, which one thread calls at a time unless it is `concurrent`."""
+    with contextlib.nullcontext() if sampler.concurrent else sampler._keeper.lock:
+        return sampler.rasterize(prepared, camera, size, layers, cull)
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:
