@@ -81,17 +81,14 @@ def _changes(
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
     begins, names, spans, parts = spans_on(gaps, sheets, seams)
-    seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
-    for k in (0, 1):
-        y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
-        seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
+    seen = read_only(layers.part), read_only(layers.depth)
     rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
     room = ROOM * (begins + 2 * np.arange(count + 1))
     while True:
         total = int(room[-1])
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        known = begins, spans, names, parts, opaque, seen, depth, room, rows, counts
+        known = gap, begins, spans, names, parts, opaque, *seen, room, rows, counts
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
             break
