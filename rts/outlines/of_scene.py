@@ -50,6 +50,8 @@ def with_outlines(
     Warns:
         InputWarning: a sampler cannot sample single points.
     """
+    from rts.sampling.merging_loops import looked_up
+
     inputs, real = None, real_of(scene)
     if all(scene.opaque) and sampled.row.shape[0] > 1:  # Else the cells stay those of a single part, and cross once.
         sampled = replace(sampled, cells=sampled.cells.first(1))
@@ -70,7 +72,7 @@ def with_outlines(
     while True:
         found, more = points.outlines(centres, count)
         samples, places = _joined(sampled.samples, more, found.beside(len(more)))
-        row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
+        row = cells.row if len(samples) == 1 else looked_up(cells.row, places.of_centres())
         stencil = found.stencil(places.beside, row, told, real)
         if fits(stencil, most) or not count:
             break
@@ -101,10 +103,9 @@ class _Places(NamedTuple):
     beside: np.ndarray
 
     def of_centres(self) -> np.ndarray:
-        """The index of each sample at a centre, counted over all of these; then −1."""
+        """The index of each sample at a centre, counted over all of these."""
         shifts = self.centres - np.cumsum(self.counts) + self.counts
-        at = np.arange(self.counts.sum()) + np.repeat(shifts, self.counts)
-        return np.append(at, -1).astype(np.int32)
+        return np.arange(self.counts.sum(), dtype=np.int32) + np.repeat(shifts.astype(np.int32), self.counts)
 
 
 def _joined(centres: Sequence[Samples], beside: Sequence[Samples], used: Any) -> tuple[tuple[Samples, ...], _Places]:

@@ -314,11 +314,13 @@ def has_pairs(part: CheckedPart, sampler: Sampler) -> bool:
 
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
+    from rts.sampling.merging_loops import looked_up
+
     if len(samples) == 1:
         part = np.minimum(cells.row, np.int32(0))
     else:
         owners = np.repeat(np.arange(len(samples), dtype=np.int32), [one.ids.shape[-2] for one in samples])
-        part = np.append(owners, np.int32(-1)).take(cells.row)
+        part = looked_up(cells.row, owners)
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
     return Fronts(part, triangle, cells.depth.astype(np.float64))

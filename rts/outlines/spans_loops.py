@@ -15,6 +15,9 @@ from rts.sampling.points_loops import corners_of, edge
 TINY = 1e-9
 """Shortest length of a span."""
 
+FEW = 64
+"""Spans of a gap up to which they are sorted one by one."""
+
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
 
@@ -349,5 +352,13 @@ def by_gap(gaps, count):
 def by_start(first, last, begins, starts, order):
     """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start."""
     for g in range(first, last):
-        own = order[begins[g] : begins[g + 1]]
-        own[:] = own[np.argsort(starts[own], kind="mergesort")]
+        if begins[g + 1] - begins[g] > FEW:
+            own = order[begins[g] : begins[g + 1]]
+            own[:] = own[np.argsort(starts[own], kind="mergesort")]
+            continue
+        for n in range(begins[g] + 1, begins[g + 1]):
+            i, at = order[n], n
+            while at > begins[g] and starts[order[at - 1]] > starts[i]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = i

@@ -37,7 +37,8 @@ def breaks_of_stacks(
     gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
-    at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
+    at = first + place[:, None] * along
+    points = np.stack([first[:, k : k + 1] + places * along[:, k : k + 1] for k in (0, 1)], axis=-1)
     slope, tangent, away = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)

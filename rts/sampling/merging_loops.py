@@ -84,6 +84,20 @@ def _put(index, z, t, y, x, k, row, depth, triangle):
     return k
 
 
+def looked_up(row: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """The entry of a table (N,) int32 for each cell of `row` (K, H, W) int32; −1 where that is −1."""
+    found = np.empty(row.size, np.int32)
+    parallel(_look_up, row.size, read_only(row, np.int32).reshape(-1), read_only(table, np.int32), found, work=row.size)
+    return found.reshape(row.shape)
+
+
+@loop
+def _look_up(start, stop, row, table, found):
+    """`looked_up`, of some cells."""
+    for i in range(start, stop):
+        found[i] = table[np.uint32(row[i])] if row[i] >= 0 else -1
+
+
 def seen_along_rays(row: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The samples (K, H, W) that rays meet before they end, and the rows (N,) that these have; both bool.
 

@@ -40,12 +40,9 @@ def value(first, last, rgba, row, stacks, out):
     """Fill rows `first` to `last` of `out` (2 H · W + R, C): composites; and, for cells, zeros at the end."""
     row = row.reshape((len(row), -1))
     cells = row.shape[1]
+    out[first:last], out[cells + len(stacks) + first : cells + len(stacks) + min(last, cells)] = 0.0, 0.0
     for m in range(first, last):
         light = 1.0
-        for c in range(out.shape[1]):
-            out[m, c] = 0.0
-            if m < cells:
-                out[cells + len(stacks) + m, c] = 0.0
         for k in range(len(row)):
             n = row[k, m] if m < cells else stacks[m - cells, k]
             if n >= 0:
