@@ -228,7 +228,8 @@ def _fill_regions(count, order, hubs, region):
 
 @compiled
 def _add_areas(
-    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, own_color, shown, colors, n
+    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, cell, centre, shown, colors,
+    parts, n,
 ):  # fmt: skip
     """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
 
@@ -248,14 +249,13 @@ def _add_areas(
         area: room for a number a region.
         of_hub: room for two numbers a hub.
         corner: the corner of the square, clockwise from the upper left: 0 to 3.
-        own_color: the cell's (flat) number, and the colour of its centre, or −1.
-        shown: (B, 2), see `_weigh_breaks`.
-        colors: cells (E,), colours (E,), weights (E,), and the colours (E,) that these are taken of, or −1: to fill
-            from `n` on.
+        cell: the cell's (flat) number.
+        centre: the colour of its centre, or −1.
+        shown: (B, 2), see `stencil_loops._of_breaks`.
+        colors: (E, 3) int32, cells, colours, and the colours that these are taken of, or −1: to fill from `n` on.
+        parts: (E,) their weights.
         n: number of entries so far.
     """
-    cell_of, color_of, weight_of, from_of = colors
-    cell, centre = own_color
     here = -1
     for p in range(count):
         area[p] = 0.0
@@ -271,7 +271,7 @@ def _add_areas(
     # Where lines for outlines cross, what they take twice is shared out.
     scale = 0.25 / total
     if centre >= 0 and area[own] * scale != 0.25:
-        cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, centre, -1, area[own] * scale - 0.25
+        colors[n, 0], colors[n, 1], colors[n, 2], parts[n] = cell, centre, -1, area[own] * scale - 0.25
         n += 1
     for r in range(count):
         if r == own or area[r] == 0:
@@ -292,42 +292,37 @@ def _add_areas(
             share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
             color = shown[breaks[ray], int((sides[ray] < 2) == (p % 2 == 0))]
             if color >= 0:
-                cell_of[n], color_of[n], from_of[n], weight_of[n] = cell, color, -1, share
+                colors[n, 0], colors[n, 1], colors[n, 2], parts[n] = cell, color, -1, share
                 n += 1
     return n
 
 
 @compiled
-def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, m):
+def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
     """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
-    cell_of, sample_of, weight_of, colors_of = motions
     for j in range(8):
         k, e = j // 2, j % 2
         cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
         tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
         before, behind = shown[tie, 0], shown[tie, 1]
-        for r in range(4):
+        for r in range(4 if before != behind else 0):
             x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
             b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
-            if b < 0 or before == behind or (x == 0 and y == 0):
-                continue
-            for i in range(2):
+            for i in range(2 if b >= 0 and (x != 0 or y != 0) else 0):
                 of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
                 of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
                 of_z = moves[b, i, 2, 0] * x + moves[b, i, 2, 1] * y
-                if movers[b, i] < 0 or (of_x == 0 and of_y == 0 and of_z == 0):
-                    continue
-                cell_of[m], sample_of[m] = cell, movers[b, i]
-                weight_of[m, 0], weight_of[m, 1], weight_of[m, 2] = of_x, of_y, of_z
-                colors_of[m, 0], colors_of[m, 1] = before, behind
-                m += 1
+                if movers[b, i] >= 0 and (of_x != 0 or of_y != 0 or of_z != 0):
+                    motions[m, 0], motions[m, 1], motions[m, 2], motions[m, 3] = cell, movers[b, i], before, behind
+                    rates[m, 0], rates[m, 1], rates[m, 2] = of_x, of_y, of_z
+                    m += 1
     return m
 
 
 @compiled
 def add_squares(
     begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
-    colors, motions,
+    colors, parts, motions, speeds,
 ):  # fmt: skip
     """Add the entries of segments, square after square, of the squares that have cells in lines `begin` to `end`.
 
@@ -382,12 +377,14 @@ def add_squares(
             _fill_regions(count, order, hubs, region)
             for k in range(4):
                 y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
-                own = y * width + x, fronts[y, x]
                 n = _add_areas(
-                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, own, shown, colors, n
+                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, y * width + x,
+                    fronts[y, x], shown, colors, parts, n,
                 )  # fmt: skip
         for s in range(first, stop):
             if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, m)
+                m = _add_fluxes(
+                    s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m
+                )
         first = stop
     return n, m

@@ -105,9 +105,7 @@ class Outlines(NamedTuple):
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
         arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32))
-        found: Any = loops.entries(*arrays)
-        (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
-        colors, motions = (cell, sample, weight.astype(real)), (moved_cell, mover, rates.astype(real), jumps)
+        colors, motions, stacks = loops.entries(*arrays, real)
         return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
 
     def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:

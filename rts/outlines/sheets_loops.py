@@ -143,9 +143,9 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
     Args:
         first: the first line.
         last: the line after the last.
-        part: (H, W) int32, the parts seen at centres.
-        triangle: (H, W) int32, and their triangles.
-        depth: (H, W) float64.
+        part: (H, W) int32, the parts seen at centres; or (K H, W), those of layers.
+        triangle: likewise, their triangles.
+        depth: likewise, float64.
         part_range: the first part that the further arguments belong to, and the one after the last.
         seen: (V, 2), see `projected`.
         rows: (4, 4), see `corners_of`.
@@ -154,18 +154,18 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
         beyond: (T, 3), the result of `neighbours`.
         keep: (T,), see `spans_loops.spans_of`: where one side of triangles is seen, two that share an edge do not fold.
         met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.meet`.
-        joined: (2, H, W) bool to fill: along x, and along y.
+        joined: (2, H, W) or (2, K H, W) bool to fill: along x, and along y.
     """
-    (height, width), corners = part.shape, np.empty((3, 4))
+    (_, height, width), corners = met.shape, np.empty((3, 4))
     apart = np.empty(width, np.bool_)
     for y in range(first, last):
         for axis in range(2):
-            dx, dy = 1 - axis, axis
-            count = width - dx if y + dy < height else 0
+            dx, dy, line = 1 - axis, axis, y % height
+            count = width - dx if line + dy < height else 0
             # Without branches, for a loop that takes several cells at once.
             for x in range(count):
                 own, there = part[y, x], part[y + dy, x + dx]
-                same = (own >= part_range[0]) & (own < part_range[1]) & (own == there) & (met[axis, y, x] != 2)
+                same = (own >= part_range[0]) & (own < part_range[1]) & (own == there) & (met[axis, line, x] != 2)
                 one = triangle[y, x] == triangle[y + dy, x + dx]
                 joined[axis, y, x] |= same & one
                 apart[x] = same & ~one
@@ -176,7 +176,7 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
                 end = s
                 next_ = keep[t] != 0 and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
                 # Around a corner that two triangles have in common the sheet neither ends nor turns away.
-                if not next_ and (met[axis, y, x] != 0 or not _touch(faces, t, s)):
+                if not next_ and (met[axis, line, x] != 0 or not _touch(faces, t, s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
                     end = _walked(t, s, start, axis, at, seen, faces, beyond)
                 joined[axis, y, x] = end == s

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.compiling.threads import parallel
+from rts.compiling.threads import parallel, read_only
 from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import moving_edges, spans_on
@@ -31,16 +31,14 @@ def breaks_of_stacks(
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         seams: as of `breaks_of_triangles`; at each there are two breaks in one place.
     """
-    gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
+    marks, joined = _gaps_to_search(layers, opaque, sheets, width)
+    gaps = Gaps.of(marks)
     whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets, seams)
     gap, near = gaps.gap[whole[:, 0]], whole[:, 1].copy()
-    joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
-    inside, part = layers.part[0] >= 0, layers.part
-    joined[0, :, :-1] = inside[:, 1:] & (part[:, :, 1:] == part[:, :, :-1]).all(0)
-    joined[1, :-1] = inside[1:] & (part[:, 1:] == part[:, :-1]).all(0)
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
-    at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
+    at = first + place[:, None] * along
+    points = np.stack([first[:, k : k + 1] + places * along[:, k : k + 1] for k in (0, 1)], axis=-1)
     slope, tangent, away = moving_edges(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
@@ -51,28 +49,29 @@ def breaks_of_stacks(
     return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides, numbers)
 
 
-def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
-    """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
-    from rts.outlines import spans_loops
+def _gaps_to_search(
+    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer.
 
-    size = layers.part.shape[1:]
+    And of those with the same parts, which are some, at both centres.
+    """
+    from rts.outlines import stacks_loops as loops
+
+    count, *size = layers.part.shape
     ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
     for part, _, depth in zip(*layers, strict=True) if opaque.any() else ():
         solid = (part >= 0) & opaque[part]
         ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
-    met, marks = np.zeros((2, *size), np.uint8), False
+    met, joined = np.zeros((2, *size), np.uint8), np.zeros((2, count * size[0], size[1]), np.bool_)
     for sheet in sheets:
         sheet.meet(ends, width, met)
-    for layer in range(len(layers.part)):
-        front = Fronts(*(np.ascontiguousarray(x[layer]) for x in layers))
-        if layer and not (front.part >= 0).any():
-            break
-        joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
-        for sheet in sheets:
-            sheet.join(front, met, joined)
-        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=front.part.size // 2)
-        marks = marks | wanted
-    return np.asarray(marks)
+    below = Fronts(*(x.reshape(-1, size[1]) for x in layers))  # One layer after the other.
+    for sheet in sheets:
+        sheet.join(below, met, joined)
+    marks, same = np.empty(met.shape, np.bool_), np.empty(met.shape, np.bool_)
+    parallel(loops.wanted, size[0], read_only(layers.part), joined, met, marks, same, work=2 * layers.part.size)
+    return marks, same
 
 
 def _changes(
@@ -83,17 +82,14 @@ def _changes(
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
     begins, names, spans, parts = spans_on(gaps, sheets, seams)
-    seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
-    for k in (0, 1):
-        y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
-        seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
+    seen = read_only(layers.part), read_only(layers.depth)
     rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
     room = ROOM * (begins + 2 * np.arange(count + 1))
     while True:
         total = int(room[-1])
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        known = begins, spans, names, parts, opaque, seen, depth, room, rows, counts
+        known = gap, begins, spans, names, parts, opaque, *seen, room, rows, counts
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
             break

@@ -31,6 +31,32 @@ PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE, EDGES = range(8)
 −1; 1 if its run is real; 1 if the run is, or has been, in the stack; the last of the span's `names`."""
 
 
+@loop
+def wanted(first, last, part, joined, met, gaps, same):
+    """Fill in the gaps, in lines `first` to `last`, in which a layer may change.
+
+    Args:
+        first: the first line.
+        last: the line after the last.
+        part: (K, H, W) int32, the parts seen at centres.
+        joined: (2, K H, W) bool, true if a sheet joins a layer to that of the next centre; see `sheets_loops.seams`.
+        met: (2, H, W) uint8, 2 where a silhouette passes.
+        gaps: (2, H, W) bool to fill: something is seen at one of both centres that no sheet joins; or `met` is 2.
+        same: (2, H, W) bool to fill: the same parts are seen at both, and some.
+    """
+    layers, height, width = part.shape
+    for axis in range(2):
+        for y in range(first, last):
+            count, below = (width - 1, y) if axis == 0 else (width if y + 1 < height else 0, y + 1)
+            for x in range(width):
+                gaps[axis, y, x], same[axis, y, x] = met[axis, y, x] == 2, x < count and part[0, y, x] >= 0
+            for k in range(layers):  # Without branches, for loops that take several cells at once.
+                for x in range(count):
+                    one, other = part[k, y, x], part[k, below, x + 1 - axis]
+                    gaps[axis, y, x] |= ((one & other) >= 0) & ~joined[axis, k * height + y, x]
+                    same[axis, y, x] &= one == other
+
+
 @compiled(inline="always")
 def _alike(own, i, j, place):
     """True if two spans have about one depth at a place."""
@@ -52,38 +78,38 @@ def _link(own, of, n):
 
 
 @compiled(inline="always")
-def _listed(part, z, seen, depth, g, k):
+def _listed(part, z, seen, depth, y, x):
     """1 if the samples at a centre hold one of a part at a depth; −1 if they hide it; else 0."""
     # Behind all that is listed, where the list is full.
-    found = -1 if z > depth[g, k, seen.shape[2] - 1] else 0
-    for layer in range(seen.shape[2]):
-        if seen[g, k, layer] < 0:
+    found = -1 if z > depth[len(seen) - 1, y, x] else 0
+    for layer in range(len(seen)):
+        if seen[layer, y, x] < 0:
             found = 0
             break
-        if seen[g, k, layer] == part and abs(depth[g, k, layer] - z) <= SAME * abs(z):
+        if seen[layer, y, x] == part and abs(depth[layer, y, x] - z) <= SAME * abs(z):
             found = 1
             break
     return found
 
 
 @compiled(inline="always")
-def _hides(opaque, z, seen, depth, g, k):
+def _hides(opaque, z, seen, depth, y, x):
     """True if a sample at a centre hides what lies at a depth."""
     found = False
-    for layer in range(seen.shape[2]):
-        found |= seen[g, k, layer] >= 0 and opaque[seen[g, k, layer]] and depth[g, k, layer] < z
+    for layer in range(len(seen)):
+        found |= seen[layer, y, x] >= 0 and opaque[seen[layer, y, x]] and depth[layer, y, x] < z
     return found
 
 
 @compiled(inline="always")
-def _settle(head, tail, own, of, opaque, seen, depth, g):
+def _settle(head, tail, own, of, opaque, seen, depth, gap, g):
     """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
 
     A run that covers a centre with no sample there touches the line with an edge alone.
     """
     real = True
     for k in range(2):
-        centre = float(k)
+        centre, y, x = float(k), gap[g, 0] + k * (1 - gap[g, 2]), gap[g, 1] + k * gap[g, 2]
         start, end = own[head, LOW], own[tail, HIGH]
         if not real or start > centre + CLOSE or end < centre - CLOSE:
             continue
@@ -91,9 +117,9 @@ def _settle(head, tail, own, of, opaque, seen, depth, g):
         while own[i, HIGH] < centre and of[i, AFTER] >= 0:
             i = of[i, AFTER]
         z = depth_at(own, i, centre)
-        found = _listed(of[head, PART], z, seen, depth, g, k)
+        found = _listed(of[head, PART], z, seen, depth, y, x)
         if start < centre - CLOSE and end > centre + CLOSE:
-            real = found != 0 or _hides(opaque, z, seen, depth, g, k)
+            real = found != 0 or _hides(opaque, z, seen, depth, y, x)
             continue
         if abs(start - centre) <= CLOSE:
             if k == 0:
@@ -307,7 +333,7 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
 
 
 @compiled(inline="always")
-def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
+def _fill_runs(g, n, own, of, opaque, seen, depth, gap, knots):
     """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
     _link(own, of, n)
     for i in range(n):
@@ -316,7 +342,7 @@ def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
         tail, j = i, i
         while of[tail, AFTER] >= 0:
             tail = of[tail, AFTER]
-        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _settle(i, tail, own, of, opaque, seen, depth, g)
+        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _settle(i, tail, own, of, opaque, seen, depth, gap, g)
         while j >= 0:
             of[j, LIVE] = real
             j = of[j, AFTER]
@@ -404,7 +430,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
 
 @loop
 def changes(
-    first, last, begins, spans, names, parts, opaque, seen, depth, room, rows, counts, inner, whole,
+    first, last, gap, begins, spans, names, parts, opaque, seen, depth, room, rows, counts, inner, whole,
     place_of, samples, places, sides,
 ):  # fmt: skip
     """Fill in the changes of stacks along gaps, in order.
@@ -414,13 +440,14 @@ def changes(
     Args:
         first: the first gap.
         last: the gap after the last.
+        gap: (M, 3), see `Gaps`.
         begins: (M + 1,) where the spans of each gap begin.
         spans: (N, 6) or (N, 9), see `spans_loops.spans_of`.
         names: (N, 3), see `spans_loops.spans_of`.
         parts: (N,) int32.
         opaque: bool, for each part.
-        seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
-        depth: (M, 2, K) float64, their depths.
+        seen: (K, H, W) int32, the parts of the samples at centres; −1 where there are no more.
+        depth: (K, H, W) float64, their depths.
         room: (M + 1,) int64, the rows of what follows up to which there is room for the changes of gaps before each.
         rows: (M,) int64 to fill: the row where the changes of each gap begin; −1 where there is too little room.
         counts: (M,) int32 to fill: the number of changes of each gap.
@@ -448,7 +475,7 @@ def changes(
             own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
             of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
             of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE], of[i, EDGES] = -1, -1, 0, 0, names[x, 2]
-        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0
+        known, count = _fill_runs(g, n, own, of, opaque, seen, depth, gap, knots), 0
         for i in range(n):
             if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
                 _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))

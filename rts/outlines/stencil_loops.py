@@ -50,7 +50,8 @@ def _former(gap, b, i, joined):
 
 @compiled
 def _add_sides(
-    begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, motions, n, m
+    begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, parts, motions,
+    rates, n, m,
 ):  # fmt: skip
     """Add the entries of the surfaces on both sides of breaks with cells in lines `begin` to `end`; see `entries`.
 
@@ -66,7 +67,6 @@ def _add_sides(
         The numbers of entries of colours, and of motions.
     """
     width = fronts.shape[1]
-    cell_of, color_of, weight_of, from_of = colors
     for b in range(len(gap)):
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
         if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
@@ -87,82 +87,56 @@ def _add_sides(
             farther = ahead * ahead * rate * outside**2 / 2
             for at, color, share in ((cell, here, nearer), (next_, last, farther)):
                 if share > 0 and former >= 0 and color != former:
-                    cell_of[n], color_of[n], from_of[n], weight_of[n] = at, former, color, share
+                    colors[n, 0], colors[n, 1], colors[n, 2], parts[n] = at, former, color, share
                     n += 1
             mine = inside / (length if length > 1e-6 else 1.0)
             across = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
             shares = (cell, mine), (next_, 1 - mine)
-            if stack.shape[2] > 0:
-                along = -0.5 * way * right, -0.5 * way * (1 - right)
-                m, further = _add_layers(b, i, stack, row, y, x, here, further, shares, across, along, motions, m)
+            if stack.shape[2] == 0:
+                for at, share in shares:
+                    m = _add_motion(motions, rates, m, at, rows[b, i], share, across, last, here)
+                    m = _add_motion(motions, rates, m, at, row[0, y, x], share, across, last, here)
                 continue
-            for at, share in shares:
-                m = _add_motion(motions, m, at, rows[b, i], share, across, last, here)
-                m = _add_motion(motions, m, at, row[0, y, x], share, across, last, here)
+            # The composite of a cell changes as that of a stack where one layer is that of the break.
+            along = -0.5 * way * right, -0.5 * way * (1 - right)
+            for k in range(len(row)):
+                own, there, stays = row[k, y, x], stack[b, i, k], False
+                if own == there:
+                    continue
+                for other in range(len(row)):
+                    stays |= stack[b, 1 - i, other] == there
+                for at, share in shares:
+                    for sample in (own, there):
+                        m = _add_motion(motions, rates, m, at, sample, share, along if stays else across, further, here)
+                further += 1
     return n, m
 
 
-@compiled
-def _add_layers(b, i, stack, row, y, x, here, further, shares, across, along, motions, m):
-    """Add the entries of motions of layers on a side of a break.
-
-    The composite of a cell changes as that of a stack where one layer is that of the break.
-
-    Args:
-        b: the break.
-        i: the side.
-        stack: (B, 2, K).
-        row: (K, H, W).
-        y: the cell on this side.
-        x: likewise.
-        here: the composite of this cell, which is its number.
-        further: the composite of the first of these stacks.
-        shares: two cells, and what each has of the change.
-        across: along x and y, by what layers move it that end at the break.
-        along: likewise, of layers that go on.
-        motions: to fill from `m` on.
-        m: number of entries so far.
-
-    Returns:
-        The number of entries, and the composite of the first stack of the next side.
-    """
-    for k in range(len(row)):
-        own, there, stays = row[k, y, x], stack[b, i, k], False
-        if own == there:
-            continue
-        for other in range(len(row)):
-            stays |= stack[b, 1 - i, other] == there
-        moves = along if stays else across
-        for at, share in shares:
-            m = _add_motion(motions, m, at, own, share, moves, further, here)
-            m = _add_motion(motions, m, at, there, share, moves, further, here)
-        further += 1
-    return m, further
-
-
 @compiled(inline="always")
-def _add_motion(motions, m, cell, sample, share, moves, color, other):
+def _add_motion(motions, rates, m, cell, sample, share, moves, color, other):
     """Add an entry of motions along x and y, unless it is 0. Returns the new number of entries."""
     x, y = share * moves[0], share * moves[1]
     if sample >= 0 and color != other and (x != 0 or y != 0):
-        motions[0][m], motions[1][m] = cell, sample
-        motions[2][m, 0], motions[2][m, 1], motions[2][m, 2] = x, y, 0.0
-        motions[3][m, 0], motions[3][m, 1] = color, other
+        motions[m, 0], motions[m, 1], motions[m, 2], motions[m, 3] = cell, sample, color, other
+        rates[m, 0], rates[m, 1], rates[m, 2] = x, y, 0.0
         m += 1
     return m
 
 
 @compiled
-def _by_cells(cell, count, start, cells):
-    """Where the entries of each of so many `cells` from `start` on begin in `order`, and this, the order of these."""
+def _by_cells(entries, count, start, cells):
+    """Where the entries of each of so many `cells` from `start` on begin in `order`, and this, the order of these.
+
+    The first column of entries has their cells.
+    """
     first, order = np.zeros(cells + 2, np.int64), np.empty(count, np.int64)
     for n in range(count):
-        if 0 <= cell[n] - start < cells:
-            first[cell[n] - start + 2] += 1
+        if 0 <= entries[n, 0] - start < cells:
+            first[entries[n, 0] - start + 2] += 1
     for i in range(cells):
         first[i + 2] += first[i + 1]
     for n in range(count):
-        at = cell[n] - start + 1
+        at = entries[n, 0] - start + 1
         if 0 < at <= cells:
             order[first[at]] = n
             first[at] += 1
@@ -179,14 +153,13 @@ def _at(colors, several, color):
 
 
 @compiled
-def _sorted_colors(colors, count, start, cells, fronts):
+def _sorted_colors(colors, parts, count, start, cells, fronts):
     """Entries of colours by cell, one for each colour of a cell, without those of 0.
 
     In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts:
     regions fill the cell, and of a colour no more is taken than there is.
     """
-    raw_cell, raw_color, raw_weight, raw_from = colors
-    first, order = _by_cells(raw_cell, count, start, cells)
+    first, order = _by_cells(colors, count, start, cells)
     cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count)
     color, weight, front, n = np.empty(count + 1, np.int32), np.empty(count + 1), fronts.reshape(-1), 0
     for i in range(cells):
@@ -195,14 +168,14 @@ def _sorted_colors(colors, count, start, cells, fronts):
         own, several = front[start + i], 1
         color[0], weight[0] = own, 1.0 if own >= 0 else 0.0
         for e in range(first[i], first[i + 1]):  # In the order of entries: areas before what is taken of them.
-            entry, taken = order[e], raw_weight[order[e]]
-            if raw_from[entry] >= 0:
-                at = _at(color, several, raw_from[entry])
+            entry, taken = order[e], parts[order[e]]
+            if colors[entry, 2] >= 0:
+                at = _at(color, several, colors[entry, 2])
                 taken = min(taken, max(weight[at], 0.0)) if at < several else 0.0
                 weight[min(at, several - 1)] -= taken
-            at = _at(color, several, raw_color[entry])
+            at = _at(color, several, colors[entry, 1])
             if at == several:
-                color[at], weight[at], several = raw_color[entry], 0.0, several + 1
+                color[at], weight[at], several = colors[entry, 1], 0.0, several + 1
             weight[at] += taken
         for e in range(several):
             share = max(weight[e], 0.0) - (1 if e == 0 and own >= 0 else 0)
@@ -212,11 +185,13 @@ def _sorted_colors(colors, count, start, cells, fronts):
     return cell_of[:n], color_of[:n], weight_of[:n]
 
 
-@compiled
-def _sorted_motions(motions, count, start, cells):
-    """Entries of motions by cell."""
-    _, order = _by_cells(motions[0], count, start, cells)
-    return motions[0][order], motions[1][order], motions[2][order], motions[3][order]
+@loop
+def _sort_motions(motions, rates, order, cell, sample, weight, colors):
+    """Fill in entries of motions in an order."""
+    for n in range(len(order)):
+        e = order[n]
+        cell[n], sample[n], colors[n, 0], colors[n, 1] = motions[e, 0], motions[e, 1], motions[e, 2], motions[e, 3]
+        weight[n, 0], weight[n, 1], weight[n, 2] = rates[e, 0], rates[e, 1], rates[e, 2]
 
 
 @loop
@@ -282,31 +257,32 @@ def _in_lines(
     begin, end, place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row,
     fronts, shown, movers, moves, normal, first_stack,
 ):  # fmt: skip
-    """The entries in the cells of lines `begin` to `end`, without stacks; see `entries`."""
+    """The entries in the cells of lines `begin` to `end`: colours as of `entries`, and motions, with their order."""
     segments, breaks, width = 0, 0, row.shape[2]
     for s in range(len(square)):
         segments += begin - 1 <= square[s, 0] < end
     for b in range(len(place)):
         breaks += begin - 1 <= gap[b, 0] < end
     most = 20 * segments + 4 * breaks
-    colors = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most, np.int32)
+    colors, parts = np.empty((most, 3), np.int32), np.empty(most)
     most = 64 * segments + 8 * breaks * len(row)
-    motions = np.empty(most, np.int32), np.empty(most, np.int32), np.empty((most, 3)), np.empty((most, 2), np.int32)
+    motions, rates = np.empty((most, 4), np.int32), np.empty((most, 3))
     n, m = add_squares(
         begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
-        colors, motions,
+        colors, parts, motions, rates,
     )  # fmt: skip
     n, m = _add_sides(
-        begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, motions, n,
-        m,
+        begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, parts,
+        motions, rates, n, m,
     )  # fmt: skip
     start, cells = begin * width, (end - begin) * width
-    return *_sorted_colors(colors, n, start, cells, fronts), *_sorted_motions(motions, m, start, cells)
+    order = _by_cells(motions, m, start, cells)[1]
+    return *_sorted_colors(colors, parts, n, start, cells, fronts), motions, rates, order
 
 
 def entries(
     place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
-    joined, row,
+    joined, row, real,
 ):  # fmt: skip
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
@@ -329,6 +305,7 @@ def entries(
         pull: (S, 4).
         joined: (2, H, W).
         row: (K, H, W) int32, the samples in cells.
+        real: the dtype of weights.
 
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
@@ -349,5 +326,14 @@ def entries(
             found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_breaks)
 
     parallel(some, bands, work=1500 * len(square))
-    columns = [x[0] if bands == 1 else np.concatenate(x) for x in zip(*found, strict=True)]
-    return columns[:3], columns[3:], stacks
+    at = np.cumsum([0, *(len(order) for *_, order in found)])
+    count = int(at[-1])
+    motions = *np.empty((2, count), np.int32), np.empty((count, 3), real), np.empty((count, 2), np.int32)
+
+    def sort(first, last):
+        for i in range(first, last):
+            _sort_motions(*found[i][3:], *(x[at[i] : at[i + 1]] for x in motions))
+
+    parallel(sort, bands, work=20 * count)
+    cell, color, weight = (np.concatenate(x) for x in zip(*(x[:3] for x in found), strict=True))
+    return (cell, color, weight.astype(real)), motions, stacks

@@ -99,12 +99,12 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.splatting import layers_loops as loops
 
-    row, stacks, used = operands[2], operands[4], np.zeros(len(operands[0]), np.bool_)
+    row, stacks = operands[2], operands[4]
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    arrays, cells, rows = (*operands[1:], read_only(g), g_positions, g_rgba), math.prod(row.shape[1:]), row[row >= 0]
-    used[rows] = True
+    arrays, cells = (*operands[1:], read_only(g), g_positions, g_rgba), math.prod(row.shape[1:])
     # Cells that share a sample add to it one after the other.
-    parallel(loops.pull, cells, *arrays, work=15 * row.size if np.count_nonzero(used) == len(rows) else 0)
+    apart = loops.distinct(row.reshape(-1), np.zeros(len(operands[0]), np.bool_))
+    parallel(loops.pull, cells, *arrays, work=15 * row.size if apart else 0)
     loops.pull(cells, cells + len(stacks), *arrays)
 
 

@@ -40,12 +40,9 @@ def value(first, last, rgba, row, stacks, out):
     """Fill rows `first` to `last` of `out` (2 H · W + R, C): composites; and, for cells, zeros at the end."""
     row = row.reshape((len(row), -1))
     cells = row.shape[1]
+    out[first:last], out[cells + len(stacks) + first : cells + len(stacks) + min(last, cells)] = 0.0, 0.0
     for m in range(first, last):
         light = 1.0
-        for c in range(out.shape[1]):
-            out[m, c] = 0.0
-            if m < cells:
-                out[cells + len(stacks) + m, c] = 0.0
         for k in range(len(row)):
             n = row[k, m] if m < cells else stacks[m - cells, k]
             if n >= 0:
@@ -92,21 +89,23 @@ def push(first, last, rgba, row, joined, stacks, t_positions, t_rgba, out):
 
 
 @compiled(inline="always")
-def _slope(rgba, before, after, g, moved, behind):
-    """The product of a layer's slope, as the composite shows it, and the gradient of a cell; given that of `behind`."""
-    opacity, change = rgba[after, rgba.shape[1] - 1] - rgba[before, rgba.shape[1] - 1], 0.0
-    for c in range(rgba.shape[1]):
-        change += (rgba[after, c] - rgba[before, c]) * g[moved, c]
-    return 0.5 * (change - opacity * behind)
-
-
-@compiled(inline="always")
 def _any(g, m):
     """True if a row of a gradient is not 0."""
     found = False
     for c in range(g.shape[1]):
         found |= g[m, c] != 0
     return found
+
+
+@loop
+def distinct(row, used):
+    """True if no two cells of `row` (C,) name one sample; `used` (N,), False for all, are marked."""
+    for n in row:
+        if n >= 0:
+            if used[np.uint32(n)]:
+                return False
+            used[np.uint32(n)] = True
+    return True
 
 
 @loop
@@ -134,8 +133,13 @@ def pull(first, last, rgba, row, joined, stacks, g, g_positions, g_rgba):
             if len(g_positions) and m < cells:
                 left, right = _beside(row, joined, layers[k], y, x, 0)
                 up, down = _beside(row, joined, layers[k], y, x, 1)
-                g_positions[n, 0] -= light * _slope(rgba, left, right, g, moved, moved_behind)
-                g_positions[n, 1] -= light * _slope(rgba, up, down, g, moved, moved_behind)
+                # The product of the layer's slopes, as the composite shows them, and the gradient of the motion.
+                of_x, of_y = 0.0, 0.0
                 for c in range(alpha + 1):
+                    of_x += (rgba[right, c] - rgba[left, c]) * g[moved, c]
+                    of_y += (rgba[down, c] - rgba[up, c]) * g[moved, c]
                     own_moved += rgba[n, c] * g[moved, c]
+                aside, below = rgba[right, alpha] - rgba[left, alpha], rgba[down, alpha] - rgba[up, alpha]
+                g_positions[n, 0] -= light * (0.5 * (of_x - aside * moved_behind))
+                g_positions[n, 1] -= light * (0.5 * (of_y - below * moved_behind))
                 moved_behind = own_moved + passed * moved_behind
