@@ -51,7 +51,8 @@ def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int,
     values = stopped(values_of(scene, grid))
     operands = [x for x in leaves(values) if type(x) is not np.ndarray]
     traced = any(map(is_traced, operands))
-    if not traced and not any(map(is_batched, operands)):
+    padded = scene.context.like is not None and engine.padded(scene.context.like)
+    if not traced and not padded and not any(map(is_batched, operands)):
         return None
     return _Call(scene, grid, request, layers, told, values, traced).sampled(operands)
 
