@@ -168,12 +168,11 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
     """
     for x in arrays:
         engine = OWNERS.get(type(x)) or engine_of(x)
-        if not engine.on_host(x):
+        values = engine.at_hand(x)
+        if values is None and not engine.on_host(x):
             below_all = value_of(engine.namespace.all(abs(x) < below))
             if below_all is not None and not below_all.all():
                 return False
-            continue
-        values = engine.known(x)
         if values is None or not values.size:
             continue
         # Repeated values are checked once. Sums and products would start threads of their own, or overflow.

@@ -135,6 +135,10 @@ class Engine(Plugin):
         """
         return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
 
+    def at_hand(self, x: Array) -> np.ndarray | None:
+        """The value of an array in the host's memory; None if it is on another device, or traced."""
+        return self.known(x) if self.on_host(x) else None
+
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
         """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.utils.checkpoint
+from torch.compiler import is_compiling, is_dynamo_compiling
 from torch.utils import _pytree
 
 from rts import Engine, InputError
@@ -63,15 +64,11 @@ class TorchEngine(Engine):
         Of read-only tables of integers, such as a mesh's faces, one tensor is made for each device, and kept as long as
         they live: their numbers must stay, and nobody may change the result in place.
         """
-        array = np.asarray(value)
-        dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
-        if array.dtype != dtype and array.dtype.kind == "f":
-            # Too large numbers become infinite. torch takes longer for a matrix.
-            with np.errstate(over="ignore"):
-                array = array.astype(dtype, "C")
-            if like is None or like.is_cpu:
-                return torch.from_numpy(array)
-        device = _CPU if like is None else like.device
+        array, device = np.asarray(value), _CPU if like is None else like.device
+        wide = like is not None and like.dtype is torch.float64
+        if array.dtype.kind == "f" and array.dtype != (np.float64 if wide else np.float32):
+            # Too large numbers become infinite.
+            return torch.tensor(array, dtype=torch.float64 if wide else torch.float32, device=device)
         if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)
         key = id(array), device
@@ -92,7 +89,7 @@ class TorchEngine(Engine):
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
-        return torch.compiler.disable(f) if torch.compiler.is_compiling() else f
+        return torch.compiler.disable(f) if is_dynamo_compiling() else f
 
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
         """`x` detached."""
@@ -143,11 +140,17 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if torch.compiler.is_compiling() or torch_internals.is_legacy_batchedtensor(x):
+        if is_dynamo_compiling() or (type(x) is not torch.Tensor and is_compiling()):
+            return None
+        if torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)
         return torch_internals.value_within(x, to_host)
+
+    def at_hand(self, x: torch.Tensor) -> np.ndarray | None:
+        """See `Engine.at_hand`."""
+        return self.known(x) if x.is_cpu else None
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""

@@ -7,6 +7,7 @@
 - `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
   alone are wanted.
 - `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
+- `eagerly` calls a `Function` outside of transforms without a look at each argument in Python.
 
 With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
 each value read takes longer.
@@ -100,6 +101,6 @@ forward_level = partial(getattr, forward_ad, "_current_level", 0)
 """() → the level of forward mode, negative where it is off; 0 from a torch that does not tell."""
 
 
-def differentiated() -> bool:
-    """True under a `torch.func` transform, or in forward mode."""
-    return current_level() is not None or forward_level() >= 0
+def eagerly(function: type[torch.autograd.Function]) -> Callable:
+    """The `apply` of a `Function` outside of transforms, whose arguments are not left over from one that has ended."""
+    return getattr(super(torch.autograd.Function, function), "apply", function.apply)
