@@ -38,12 +38,14 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         return tree if owner.plain(tree) else owner.admitted(tree, name)
     if tree is None or kind in _NUMBERS:
         return tree
-    if isinstance(tree, Mapping):
+    if kind is dict or isinstance(tree, Mapping):
         entries = {}
         for key, value in tree.items():
             if not isinstance(key, str):
                 raise InputError(f"{name} has the key {key!r}; expected names")
-            entries[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
+            owner = OWNERS.get(type(value))
+            plain = type(value) is np.ndarray and value.dtype in _ORDINARY if owner is None else owner.plain(value)
+            entries[key] = value if plain else from_numbers(value, f"{name}[{key!r}]")
         return entries
     if isinstance(tree, (list, tuple)):
         numbers = [isinstance(x, (bool, int, float)) for x in leaves(tree)]
@@ -69,14 +71,6 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         what = " ".join(repr(tree).split())
         raise InputError(f"{name} is {what if len(what) <= 60 else kind_of(tree)}; expected an array") from None
     return engine.admitted(tree, name)
-
-
-def _is_plain(x: Any) -> bool:
-    """True for an array that needs no conversion."""
-    if type(x) is np.ndarray:
-        return x.dtype in _ORDINARY
-    owner = OWNERS.get(type(x))
-    return owner is not None and owner.plain(x)
 
 
 _NUMBERS = (bool, int, float)

@@ -151,7 +151,7 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
         InputError: `engine` is no name of an engine.
         EngineError: arrays of two engines, of another one than `engine`, or on two devices.
     """
-    scene_engine, like = context_of(parts, *others)
+    scene_engine, like = context = context_of(parts, *others)
     if engine is not None:
         if not isinstance(engine, str):
             raise InputError(f"engine is a {type(engine).__name__}; expected a name, such as 'torch' or 'jax'")
@@ -162,7 +162,7 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
             )
         scene_engine = wanted
     if like is not None:
-        return Context(scene_engine, like)
+        return context
     thetas = collected([part.theta for part in parts])
     is_wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
     if scene_engine.name == "numpy":
@@ -260,7 +260,7 @@ def _widest(arrays: Sequence[Any]) -> Array | None:
     for x in arrays:
         if isinstance(x, CONSTANT_TYPES):
             continue
-        width = floating_bits(x)
+        width = _BITS.get(x.dtype) or floating_bits(x)
         if width > bits:
             widest, bits = x, width
     return widest
@@ -292,7 +292,14 @@ def stopped(tree: Tree) -> Tree:
     owner = OWNERS.get(type(tree))
     if owner is not None:
         return owner.stop_gradient(tree)
-    return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)
+    return map_leaves(_stopped, tree)
+
+
+def _stopped(x: Any) -> Any:
+    owner = OWNERS.get(type(x))
+    if owner is None:
+        return x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x)
+    return owner.stop_gradient(x)
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

@@ -23,7 +23,7 @@ def to_splats(
     sampled: Sampled,
     parts: Sequence[CheckedPart],
     camera: Camera,
-    window: Camera,
+    grid: Grid,
     context: Context,
 ) -> Splats:
     """Evaluate, shade and project samples into splats, with the apron as border. Fine samples are left out.
@@ -32,12 +32,10 @@ def to_splats(
         sampled: the samples.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
-        window: the camera of the samples.
+        grid: the cells of the samples, with the camera in the local space of each part.
         context: the engine to compute with, and an exemplar of its constants and of the splats.
     """
-    height, width, apron = *sampled.row.shape[1:], sampled.apron
-    grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
-    sampled = owned(sampled, sampled.row, context)
+    apron, sampled = sampled.apron, owned(sampled, sampled.row, context)
     positions, rgba = concatenated(
         *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, sampled.stencil)
     )
@@ -81,18 +79,19 @@ def _positions_and_colors(
         row: integers, the indices of the visible samples, counted over all parts; −1 for none.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
-        grid: the cells of the samples, and their camera.
+        grid: the cells of the samples, and their cameras.
         context: the engine to compute with, and an exemplar of the results.
         stencil: names the samples beside outlines, behind those of cells; None without outlines.
     """
     inputs, engine = of_inputs(context), context.engine
-    world_camera = grid.camera.replace(view=inputs.constants(grid.camera.view))
     camera = context.constants(camera)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
         theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
         local = evaluate(part, samples, inputs)
-        local_camera = world_camera.within(transform)
+        local_camera = grid.cameras[index]
+        if not engine.owns(local_camera.view):  # The context's engine is that of the background, or of a shader.
+            local_camera = local_camera.replace(view=inputs.constants(local_camera.view))
         add_footprint(part, samples, local, local_camera, grid.size, inputs)
         padded = stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
         used = all_in_use(samples, inputs, stencil, first) if padded else samples

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 
@@ -39,14 +40,13 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     Returns:
         The camera, the last row of its view without rounding.
     """
-    for name, matrix in (("view", camera.view), ("projection", camera.projection)):
-        if not np.isfinite(matrix).all():
+    largest = largest_absolute(camera.view), largest_absolute(camera.projection)
+    for name, size in zip(("view", "projection"), largest, strict=True):
+        if not size < math.inf:
             bad = name == "view" and transform is not None and not np.isfinite(transform).all()
             what = "transform of a part" if bad else f"camera's {name} matrix"
             raise InputError(f"the {what} holds NaN or infinity; check how it was made")
-    if max(map(largest_absolute, (camera.view, camera.projection))) > LARGEST:
-        _refuse_large(camera, transform)
-    if largest_absolute(camera.projection @ camera.view) > LARGEST:
+    if max(largest) > LARGEST or largest_absolute(camera.projection @ camera.view) > LARGEST:
         _refuse_large(camera, transform)
     # Most are far from singular; singular values take longer.
     well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED

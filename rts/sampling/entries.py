@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import OWNERS, host_value, is_constant, stopped, value_of
+from rts.arrays.engines import CONSTANT_TYPES, OWNERS, host_value, is_constant, stopped, value_of
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
+from rts.plugin_base import is_subclass
 from rts.sampling.cache import Entry
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -19,12 +20,11 @@ from rts.scene.camera import Camera
 
 def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
+    arrays = []
     for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
-        if type(x) is not np.ndarray:
-            shape, value = _probed(x)
-            if value is None or value.ndim != len(shape):
-                return False
-    return True
+        if not isinstance(x, CONSTANT_TYPES):
+            arrays.append(x)
+    return scene.context.engine.are_known(arrays)
 
 
 def is_still(scene: Scene) -> bool:
@@ -63,11 +63,11 @@ def inputs_of(scene: Scene) -> list[Tree]:
 
 def proxy_inputs(part: CheckedPart) -> Tree:
     """The inputs of a part's proxy, without derivatives; None if it has no triangles."""
-    surface = part.surface
-    return stopped(surface.proxy_inputs(stopped(part.theta))) if isinstance(surface, TriangleSurface) else None
+    surface: Any = part.surface
+    return stopped(surface.proxy_inputs(stopped(part.theta))) if is_subclass(type(surface), TriangleSurface) else None
 
 
 def entry_of(part: CheckedPart, sampler: TriangleSampler, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
     """The part's prepared entry, with the inputs of its proxy, on the host."""
     surface: Any = part.surface
-    return sampler.working_on(surface, inputs, camera, size, None, lambda known: known._replace(inputs=inputs))
+    return sampler.working_on(surface, inputs, camera, size, None, lambda known: Entry(*known[:2], inputs))

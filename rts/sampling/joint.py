@@ -6,6 +6,7 @@ a transform of its vertices, into the camera's space, and a call of its shader, 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import numpy as np
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import overrides
+from rts.plugin_base import is_subclass, overrides
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -80,7 +81,7 @@ class Joint:
         """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
         starts = np.array([0, *itertools.accumulate(len(proxy.faces) for proxy in proxies)], np.int32)
         sampler, proxy = scene.samplers[first], proxies[0]
-        assert isinstance(sampler, TriangleSampler)
+        assert is_subclass(type(sampler), TriangleSampler)
         ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
         if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
             proxy, prepared = proxy._replace(ids=ids[0]), scene.entries[first].prepared
@@ -153,7 +154,7 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
 
     These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`.
     """
-    suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
+    suited = list(map(is_suited, scene.parts, scene.samplers))
     if not all(suited) and not (any(suited) and all(map(has_sheets, scene.parts, scene.samplers))):
         return scene
     joints = []
@@ -161,7 +162,7 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
     for (suits, *_), run in runs:
         if suits:
             joints += _joined(scene, grid, list(run))
-    return scene._replace(joints=tuple(joints))
+    return Scene(*scene[:6], tuple(joints))
 
 
 def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
@@ -187,13 +188,21 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
             yield Joint.of(scene, several[0], [proxies[i] for i in several], [cameras[i] for i in several])
 
 
-def is_suited(part: CheckedPart, sampler: object) -> bool:
+def is_suited(part: CheckedPart, sampler: Any) -> bool:
     """True if a part can be sampled along with others."""
-    surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
+    surface: Any = part.surface
+    return _may_join(type(surface), type(sampler)) and sampler.joins_parts and sampler.concurrent and surface.centered
+
+
+@functools.lru_cache(maxsize=4096)
+def _may_join(surface: type, sampler: type) -> bool:
+    """True if surfaces of a class are no approximation, and samplers of a class leave their samples to this module."""
+    if not is_subclass(sampler, TriangleSampler) or not is_subclass(surface, TriangleSurface):
         return False
-    joins = sampler.joins_parts and sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
-    return joins and surface.centered and not surface.refines and not surface.depends_on_view
+    own = overrides(sampler, "update", TriangleSampler) or overrides(sampler, "sample", TriangleSampler)
+    return not (
+        own or overrides(surface, "refine", TriangleSurface) or overrides(surface, "proxy_key", TriangleSurface)
+    )
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -66,7 +66,7 @@ class TriangleSampler(Sampler):
         Results are independent of one another: those of all parts may be built before one of them is drawn.
         The default returns the proxy, once its `faces` are found to name vertices; else it raises an InputError.
         """
-        check_faces(proxy)
+        check_faces(proxy.vertices, proxy.faces)
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:

@@ -253,14 +253,18 @@ class Camera(CameraConverters):
 
     def for_size(self, size: tuple[int, int]) -> Camera:
         """The camera for images of a size (height, width): itself, or a copy of that ratio if `aspect` is "open"."""
-        if self.aspect is None or type(self.aspect) is float or isinstance(self.aspect, Real):
+        if self.aspect is None or type(self.aspect) is float:
             return self
-        if not (isinstance(self.aspect, str) and self.aspect == "open"):
+        if not isinstance(self.aspect, str) or self.aspect != "open":
+            if isinstance(self.aspect, Real):
+                return self
             raise InputError(f"aspect is {quoted(self.aspect)}; expected width over height, 'open' or None")
-        height, width = check_pixels(size)
+        (height, width), projection = check_pixels(size), self.projection
         aspect = width / height
-        columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)
-        return self.replace(projection=self.projection * columns, aspect=aspect)
+        columns = np.array([1 / aspect, 1, 1, 1])
+        known = type(projection) is np.ndarray
+        columns = columns.astype(projection.dtype) if known else engine_of(projection).constant(columns, projection)
+        return self.replace(projection=projection * columns, aspect=aspect)
 
     def map(self, f: Callable[[Array], Array]) -> Camera:
         """A copy with `f` applied to both matrices."""
@@ -272,7 +276,9 @@ class Camera(CameraConverters):
             return self
         if getattr(transform, "shape", ()) != (4, 4):
             check_numbers("transform", transform, (4, 4))
-        _, (view, transform) = promote(self.view, transform)
+        view = self.view
+        if type(view) is not type(transform) or type(view) is np.ndarray:
+            _, (view, transform) = promote(view, transform)
         return self.replace(view=matmul(view, transform))
 
     def with_apron(self, size: tuple[int, int], apron: int) -> Camera:

@@ -24,7 +24,7 @@ from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
 from rts.sampling.host_scenes import in_engine
 from rts.sampling.picture import Picture, at_once
-from rts.sampling.scene import Grid, Scene
+from rts.sampling.scene import Scene
 from rts.sampling.side_by_side import DrawnView
 from rts.scene.camera import Camera
 from rts.splatting.channels import cropped_image
@@ -157,7 +157,7 @@ def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> Draw
     """The view of a scene that can be drawn along with others; None for one that has to be drawn by itself."""
     if settings.layers == "auto" or len(settings.bands(size)) > 1 or settings.capacity is not None:
         return None
-    grid = Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron)
+    grid = settings.grid(scene, scene.camera, size)
     return DrawnView.of(scene, grid) if at_once(grid.size) > 1 else None
 
 
@@ -197,7 +197,7 @@ def _images_of_scene(
             complete = [_in_engine(picture, scenes[0]) for picture in pictures if picture is not None]
             if len(complete) == len(pictures):
                 return _as_pictures(complete, scenes, context, settings)
-            return _one_by_one(scenes, views, context, settings)
+            return _one_by_one(scenes, views, size, context, settings)
     draw = partial(image_of, size=size, context=context, settings=settings)
     images = [draw(scene) for scene in (scenes[:1] if several and not differentiates else scenes)]
     if len(images) < len(scenes):
@@ -210,7 +210,7 @@ def _sampled(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSet
     """The samples of each view, on the host if they are found there; each core samples one at a time, if it may."""
 
     def sample_view(view_scene: Scene) -> Sampled:
-        return sampled_scene(view_scene, view_scene.camera, size, settings, stays=True)
+        return sampled_scene(view_scene, settings.grid(view_scene, view_scene.camera, size), settings, stays=True)
 
     return each(sample_view, scenes) if _concurrent(scenes[0]) else list(map(sample_view, scenes))
 
@@ -228,11 +228,20 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
-def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
+def _one_by_one(
+    scenes: Sequence[Scene],
+    views: Sequence[Sampled],
+    size: tuple[int, int],
+    context: Context,
+    settings: RenderSettings,
+) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
     pairs, splatter = zip(views, scenes, strict=True), settings.splatter
     assert splatter is not None
-    images = [splatted(sampled, scene, scene.camera, context, splatter) for sampled, scene in pairs]
+    images = [
+        splatted(sampled, scene, settings.grid(scene, scene.camera, size), context, splatter)
+        for sampled, scene in pairs
+    ]
     return namespace(*images).stack(images)
 
 

@@ -18,7 +18,7 @@ from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import quoted
 from rts_backends.torch_engine import array_api, operations, torch_internals
 from rts_backends.torch_engine.functions import quiet_forward_mode, tangent_alike, transformed
-from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
+from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor, to_tensors
 
 for _cls, _split, _join in Engine.records():
     _pytree.register_pytree_node(_cls, _split, _join, serialized_type_name=f"rts.{_cls.__name__}")
@@ -106,7 +106,11 @@ class TorchEngine(Engine):
 
     def devices(self, arrays: Iterable[Any]) -> set[torch.device]:
         """The devices of the tensors. Single numbers on the CPU count for nothing: torch takes them beside any."""
-        return {x.device for x in arrays if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu)}
+        devices = set()
+        for x in arrays:
+            if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu):
+                devices.add(x.device)
+        return devices
 
     def product(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         """See `Engine.product`: by elements on devices, whose matrix units may be set to round, and in `autocast`.
@@ -151,6 +155,16 @@ class TorchEngine(Engine):
     def at_hand(self, x: torch.Tensor) -> np.ndarray | None:
         """See `Engine.at_hand`."""
         return self.known(x) if x.is_cpu else None
+
+    def are_known(self, arrays: Iterable[torch.Tensor]) -> bool:
+        """See `Engine.are_known`."""
+        if torch_internals.current_level() is not None or is_compiling():
+            return super().are_known(arrays)
+        return not any(map(torch_internals.is_legacy_batchedtensor, arrays))
+
+    def placed(self, arrays: Sequence[np.ndarray], like: torch.Tensor | None) -> Sequence[torch.Tensor]:
+        """See `Engine.placed`."""
+        return to_tensors(arrays, None if like is None else like.device)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""

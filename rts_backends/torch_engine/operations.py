@@ -44,7 +44,8 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    operands, count = tuple(map(Tensor.contiguous, operands)), operation.differentiable
+    operands = tuple(map(torch_internals.unwrap_if_dead, map(Tensor.contiguous, operands)))
+    count = operation.differentiable
     if torch_internals.current_level() is not None or torch_internals.forward_level() >= 0:
         return _Value.apply(_Call(operation=operation, params=params), *operands)
     if not (torch.is_grad_enabled() and any(map(_REQUIRES_GRAD, operands[:count]))):
@@ -175,7 +176,11 @@ class _Derivatives(torch.autograd.Function):
         if is_legacy_batchedtensor(g):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, g)
-        elif torch.is_grad_enabled() or torch_internals.current_level() is not None or torch_internals.forward_level() >= 0:
+        elif (
+            torch.is_grad_enabled()
+            or torch_internals.current_level() is not None
+            or torch_internals.forward_level() >= 0
+        ):
             found = _Pull.apply(call, wanted, *operands, g)
         else:
             found = _Pull.forward(call, wanted, *operands, g)

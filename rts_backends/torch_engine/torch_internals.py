@@ -7,7 +7,8 @@
 - `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
   alone are wanted.
 - `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
-- `eagerly` calls a `Function` outside of transforms without a look at each argument in Python.
+- `eagerly` calls a `Function` outside of transforms without a look at each argument in Python; `unwrap_if_dead` finds
+  what is left over from transforms that have ended.
 
 With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
 each value read takes longer.
@@ -27,7 +28,7 @@ _T = TypeVar("_T")
 
 try:
     from torch._C import _DisableFuncTorch
-    from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor
+    from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor, unwrap_if_dead
     from torch._C._functorch import maybe_current_level as current_level
 
     def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:  # pyright: ignore[reportRedeclaration]
@@ -76,6 +77,10 @@ except ImportError:
         """0, as if some transform were active."""
         return 0
 
+    def unwrap_if_dead(x: Tensor) -> Tensor:
+        """The tensor itself: `Function.apply` looks for what is left over from transforms."""
+        return x
+
     def is_legacy_batchedtensor(tensor: Tensor) -> bool:
         """True for a tensor without values, where no transform has wrapped it."""
         return not value_within(tensor, _is_readable)
@@ -102,5 +107,5 @@ forward_level = partial(getattr, forward_ad, "_current_level", 0)
 
 
 def eagerly(function: type[torch.autograd.Function]) -> Callable:
-    """The `apply` of a `Function` outside of transforms, whose arguments are not left over from one that has ended."""
+    """The `apply` of a `Function` outside of transforms, whose arguments have passed `unwrap_if_dead`."""
     return getattr(super(torch.autograd.Function, function), "apply", function.apply)
