@@ -111,7 +111,7 @@ def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:
 
 
 class Grid(NamedTuple):
-    """A grid of cells: its camera and its size (height, width); the camera in the local space of each part, if known."""
+    """A grid of cells: its camera and its size (height, width), and the camera in each part's local space, if known."""
 
     camera: Camera
     size: tuple[int, int]

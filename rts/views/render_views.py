@@ -236,12 +236,10 @@ def _one_by_one(
     settings: RenderSettings,
 ) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
-    pairs, splatter = zip(views, scenes, strict=True), settings.splatter
+    images, splatter = [], settings.splatter
     assert splatter is not None
-    images = [
-        splatted(sampled, scene, settings.grid(scene, scene.camera, size), context, splatter)
-        for sampled, scene in pairs
-    ]
+    for sampled, scene in zip(views, scenes, strict=True):
+        images.append(splatted(sampled, scene, settings.grid(scene, scene.camera, size), context, splatter))
     return namespace(*images).stack(images)
 
 

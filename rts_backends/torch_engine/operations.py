@@ -172,18 +172,14 @@ class _Derivatives(torch.autograd.Function):
     def backward(ctx, *gradients):
         call, operands, (g,) = ctx.call, ctx.saved_tensors, gradients
         needed = ctx.needs_input_grad
-        wanted = needed[1 : 1 + call.operation.differentiable]
+        wanted, plain = needed[1 : 1 + call.operation.differentiable], not torch.is_grad_enabled()
         if is_legacy_batchedtensor(g):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, g)
-        elif (
-            torch.is_grad_enabled()
-            or torch_internals.current_level() is not None
-            or torch_internals.forward_level() >= 0
-        ):
-            found = _Pull.apply(call, wanted, *operands, g)
-        else:
+        elif plain and torch_internals.current_level() is None and torch_internals.forward_level() < 0:
             found = _Pull.forward(call, wanted, *operands, g)
+        else:
+            found = _Pull.apply(call, wanted, *operands, g)
         # torch takes no gradient that is not needed, and so none that is empty.
         return None, *found, *[None] * (len(needed) - 1 - len(wanted))
 
