@@ -85,7 +85,7 @@ def _picture(
 ) -> DepthPicture:
     """The picture of parts that have one number of layers."""
     scene = Scene.of(parts, camera, sampler, engine).at(size)
-    settings = RenderSettings(None, layers, 1, capacity)
+    settings = RenderSettings(None, layers, 1, capacity).of(scene)
     grid = settings.grid(scene, scene.camera, size)
     sampled = sampled_scene(scene, grid, settings, one_shader=False)
     opaque, context = all(scene.opaque), scene.context

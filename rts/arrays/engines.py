@@ -216,7 +216,8 @@ def uncompiled(f: _F) -> _F:
     def call(*args: Any, **kwargs: Any) -> Any:
         outside = f
         for engine in load_engines():
-            outside = engine.uncompiled(outside)
+            if type(engine).uncompiled is not Engine.uncompiled:
+                outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]  # The wrapper has the type of `f`.

@@ -130,7 +130,8 @@ def _check_part(index: int, part: Part) -> CheckedPart:
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     checked = join_record(CheckedPart, (theta, transform), (surface, shader, part.cull))
     # Known now, and asked for at each stage.
-    checked.__dict__.update(read=dict(zip(reads, map(theta.get, reads), strict=True)), reads=promised(shader, "reads"))
+    read = dict(zip(reads, map(theta.get, reads), strict=True))
+    checked.__dict__.update(read=read, reads=promised(shader, "reads"), uniform=promised(shader, "uniform"))
     return checked
 
 

@@ -392,7 +392,8 @@ class ImageResiduals(Residuals):
 
         scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
         self._refuse_other(scene.channels)
-        sampled = sampled_scene(scene, self._settings.grid(scene, scene.camera, size), self._settings)
+        settings = self._settings.of(scene)
+        sampled = sampled_scene(scene, settings.grid(scene, scene.camera, size), settings)
         return _Band(top, rows, window, sampled, scene.parts)
 
     def _splats(self, band: _Band, parameters: Tree) -> Splats:

@@ -56,7 +56,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: shapes of ids and weights do not fit; or, on the host, an id is no index of a row.
     """
-    ids_shape, weights_shape = shape_of(ids), shape_of(weights)
+    ids_shape, weights_shape = tuple(getattr(ids, "shape", ())), tuple(getattr(weights, "shape", ()))
     plain = len(ids_shape) == len(weights_shape) == 2
     if not plain or not 0 <= column <= ids_shape[1] - 3 or weights_shape[1] < 2 or ids_shape[0] != weights_shape[0]:
         raise InputError(

@@ -105,7 +105,7 @@ class RenderSettings:
         """
         if self.splatter is None:
             return APRON
-        return self.splatter.reach + 1 + (OUTLINES_APRON if self.finds_outlines else 0)
+        return self.splatter.reach + 1 + (OUTLINES_APRON if "outlines" in self.splatter.reads else 0)
 
     def grid(self, scene: Scene, camera: Camera, size: tuple[int, int]) -> Grid:
         """The cells of an image (height, width) of a scene, or of a window of it, through its camera."""

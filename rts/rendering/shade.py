@@ -45,8 +45,9 @@ def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer
         if samples.gbuffer_names is None or (wanted is not None and set(wanted) <= set(samples.gbuffer_names)):
             return _checked(GBuffer(samples.gbuffer), part, samples)
     gbuffer = part.surface.evaluate(context.constants(theta), samples)
-    if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
-        what = f"one with {sorted(gbuffer)}" if isinstance(gbuffer, Mapping) else kind_of(gbuffer)
+    known = type(gbuffer) is GBuffer or isinstance(gbuffer, Mapping)
+    if not known or "position" not in gbuffer:
+        what = f"one with {sorted(gbuffer)}" if known else kind_of(gbuffer)
         raise InputError(f"evaluate of {part.surface!r} gave {what}; expected an rts.GBuffer with 'position'")
     return _checked(gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer), part, samples)
 
@@ -106,7 +107,7 @@ def shade(
         camera: the camera of the whole image, or of each sample.
         engine: the engine to compute with.
     """
-    world = _to_world(_readable(local, samples, engine), transform)
+    world = _to_world(_readable(local, samples, engine) if engine.padded(samples.row) else local, transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
     if part.uniform:  # One colour, however many rows are in use.
@@ -201,8 +202,6 @@ def _colors(
 
 def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
     """The G-buffer for shaders: unused rows hold values with finite derivatives, too."""
-    if not engine.padded(samples.row):
-        return gbuffer
     return gbuffer.changed(dict.fromkeys(gbuffer, lambda x: engine.fill_unused(x, samples.row)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from rts.operations.projection import projective_map
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
 from rts.sampling.scene import Grid
 from rts.scene.camera import Camera
+
+_OPAQUE = attrgetter("shader.opaque")
 
 
 def to_splats(
@@ -59,7 +62,7 @@ def splats_of(
     cells, stencil = Cells(sampled.row), sampled.stencil
     if not context.engine.owns(rgba):
         cells, stencil = context_of(positions, rgba).constants((cells, stencil))
-    opaque = all([p.shader.opaque for p in parts])
+    opaque = all(map(_OPAQUE, parts))
     return Splats(positions, rgba, cells, opaque=opaque, stencil=stencil, **more)
 
 
@@ -96,7 +99,8 @@ def _positions_and_colors(
         padded = stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
         used = all_in_use(samples, inputs, stencil, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
-        placed = projective_map(local_camera.pixel_rows(grid.size), on_rays(samples, local["position"]))
+        position = local["position"] if samples.centered else on_rays(samples, local["position"])
+        placed = projective_map(local_camera.pixel_rows(grid.size), position)
         positions.append(context.constants(placed))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(context.constants(rgba))
@@ -143,12 +147,10 @@ def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, firs
 
 
 def on_rays(samples: Samples, position: Array) -> Array:
-    """Positions (N, 3) of samples, moved onto the rays of their cells unless they are centred; derivatives stay.
+    """Positions (N, 3) of samples that are not centred, moved onto the rays of their cells; derivatives stay.
 
     Splatters need samples whose motion starts at their cells' centres. On the rays, projections are finite, too.
     """
-    if samples.centered:
-        return position
     if ON_RAYS not in samples.tables:
         raise InputError(
             f"samples are not centered, and have no table {ON_RAYS!r}: expected (N, 3), where their cells' rays are at "

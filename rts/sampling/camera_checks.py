@@ -19,7 +19,8 @@ def on_host(camera: Camera) -> Camera:
     if type(camera.view) is type(camera.projection) is np.ndarray:
         if camera.view.dtype == camera.projection.dtype == np.float64:
             return camera
-    view, projection = host_value(camera.view), host_value(camera.projection)
+    view, projection = host_value(camera.view), camera.projection
+    projection = projection if type(projection) is np.ndarray else host_value(projection)
     return camera.replace(view=np.asarray(view, np.float64), projection=np.asarray(projection, np.float64))
 
 

@@ -10,6 +10,7 @@ import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
+
+_VERTICES = attrgetter("vertices")
 
 MOST = 2**15
 """Triangles of a part that is joined to others: moving the vertices of a larger one costs more than a pass over the
@@ -67,11 +70,10 @@ class Joint:
     @classmethod
     def of(cls, scene: Scene, first: int, proxies: Sequence[Proxy], cameras: Sequence[Camera]) -> Joint:
         """Join the parts from `first` on, given their proxies and the camera in the space of each, `Proxy.seen_by`."""
-        alike = all(np.array_equal(camera.view, cameras[0].view) for camera in cameras[1:])
-        vertices = [proxy.vertices for proxy in proxies]
-        if not alike:
-            vertices = [_moved(x, camera.view) for x, camera in zip(vertices, cameras, strict=True)]
-        camera = cameras[0] if alike else Camera(np.eye(4), cameras[0].projection)
+        vertices, camera = list(map(_VERTICES, proxies)), cameras[0]
+        if len(cameras) > 1 and not all(np.array_equal(other.view, camera.view) for other in cameras[1:]):
+            vertices = [_moved(x, other.view) for x, other in zip(vertices, cameras, strict=True)]
+            camera = Camera(np.eye(4), camera.projection)
         return cls.seen_from(camera, scene, first, proxies, vertices)
 
     @classmethod
@@ -79,12 +81,15 @@ class Joint:
         cls, camera: Camera, scene: Scene, first: int, proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]
     ) -> Joint:
         """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
-        starts = np.array([0, *itertools.accumulate(len(proxy.faces) for proxy in proxies)], np.int32)
+        starts, ids = [0], []
+        for proxy in proxies:
+            starts.append(starts[-1] + len(proxy.faces))
+            ids.append(proxy.faces if proxy.ids is None else proxy.ids)
         sampler, proxy = scene.samplers[first], proxies[0]
         assert is_subclass(type(sampler), TriangleSampler)
-        ids = [proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies]
         if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
-            proxy, prepared = proxy._replace(ids=ids[0]), scene.entries[first].prepared
+            proxy = proxy._replace(ids=ids[0]) if proxy.ids is None else proxy
+            prepared = scene.entries[first].prepared
         else:
             shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
             faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
@@ -92,7 +97,8 @@ class Joint:
             tables = np.concatenate(vertices), faces, np.concatenate(ids), np.concatenate(params) if params else None
             proxy = Proxy(*tables)
             prepared = sampler.prepare(proxy)
-        return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler, prepared)
+        cull, starts = scene.parts[first].cull, np.array(starts, np.int32)
+        return cls(scene, first, starts, proxies, proxy, camera, cull, sampler, prepared)
 
     def sampled(self, size: tuple[int, int], layers: int, triangles: bool, uniform: bool = False) -> Sampled:
         """The samples at the centres of all cells; with `uniform` one sample stands for all cells of a part.
@@ -185,7 +191,7 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
     for (joins, *_), run in groups:
         numbers = list(run)
         for several in [numbers] if joins else [[number] for number in numbers if len(proxies[number].faces)]:
-            yield Joint.of(scene, several[0], [proxies[i] for i in several], [cameras[i] for i in several])
+            yield Joint.of(scene, several[0], list(map(proxies.get, several)), list(map(cameras.get, several)))
 
 
 def is_suited(part: CheckedPart, sampler: Any) -> bool:

@@ -150,7 +150,7 @@ class TriangleSampler(Sampler):
         """The surface's entry; kept from call to call unless its proxy is cheap and `prepare` the default."""
         if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
-            return Entry(proxy, self.prepare(proxy))
+            return Entry(proxy, proxy)
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:

@@ -102,7 +102,7 @@ def _positions_and_colors(
     rows = namespace(*(camera.view for camera in local_cameras)).stack(
         context_of(*(c.view for c in local_cameras)).constants([camera.pixel_rows(size) for camera in local_cameras])
     )
-    points = on_rays(whole, shown.gbuffer["position"])
+    points = shown.gbuffer["position"] if whole.centered else on_rays(whole, shown.gbuffer["position"])
     rows, points = context_of(rows, points).constants((rows, points))
     places = _places_of(pictures, Context(engine_of(points), points))
     positions = context.constants(projective_map_of_views(rows, points, view, places))
