@@ -293,14 +293,9 @@ def stopped(tree: Tree) -> Tree:
     owner = OWNERS.get(type(tree))
     if owner is not None:
         return owner.stop_gradient(tree)
-    return map_leaves(_stopped, tree)
-
-
-def _stopped(x: Any) -> Any:
-    owner = OWNERS.get(type(x))
-    if owner is None:
-        return x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x)
-    return owner.stop_gradient(x)
+    return map_leaves(
+        lambda x: x if isinstance(x, CONSTANT_TYPES) else (OWNERS.get(type(x)) or engine_of(x)).stop_gradient(x), tree
+    )
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

@@ -43,10 +43,6 @@ class GBuffer(dict):
         """An array (N, ·), a row for each sample, for its dtype and device, where no attribute is needed."""
         return self["position"] if self._like is None else self._like
 
-    @like.setter
-    def like(self, value: Any) -> None:
-        self._like = value
-
     @property
     def computed(self) -> dict[str, Any]:
         """Attributes computed so far, among them the deferred ones that have been read."""

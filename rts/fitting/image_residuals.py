@@ -400,8 +400,7 @@ class ImageResiduals(Residuals):
         """The splats of a band's samples at other values of the parameters."""
         parts, camera = _checked(*self.scene(parameters))
         context = context_of(parts, camera, band.sampled, parameters)
-        cells = self._settings.supersample * band.rows, self._settings.supersample * self.size[1]
-        grid = Grid.of_parts(parts, band.window(camera), cells, band.sampled.apron, context)
+        grid = Grid.of_samples(band.sampled, parts, band.window(camera), context)
         return to_splats(band.sampled, parts, camera.for_size(self.size), grid, context)
 
     def _of_samples(self, bands: Sequence[_Band], parameters: Tree) -> Array:

@@ -239,8 +239,7 @@ def render_samples(
         sampled = _narrowed(replace(sampled, stencil=None), apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
     context = scene.context_with(sampled, background)
-    cells = fine * size[0], fine * size[1]
-    grid = Grid.of_parts(scene.parts, scene.camera, cells, sampled.apron, context)
+    grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
     return over_background(splatted(sampled, scene, grid, context, splatter), background)
 
 

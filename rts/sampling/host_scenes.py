@@ -5,8 +5,8 @@ Samples that are found there become arrays of that engine.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
+from functools import partial
 from itertools import repeat
 from operator import is_not
 
@@ -16,12 +16,10 @@ from rts.arrays.engines import Context, engine_of, floating_bits, host_value, is
 from rts.arrays.trees import Tree, collected, join_record, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Sampled, Samples
-from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import is_subclass, overrides
 from rts.sampling.camera_checks import check_camera, on_host
 from rts.sampling.entries import entry_of, is_known, proxy_inputs
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.triangle_sampler import is_drawn
 
 
 def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
@@ -31,7 +29,7 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     has a way of its own.
     """
     for part, sampler in zip(scene.parts, scene.samplers, strict=True):
-        if not _is_drawn(type(part.surface), type(sampler)):
+        if not is_drawn(type(part.surface), type(sampler)):
             return scene, grid
     if scene.cameras or not is_known(scene, grid):
         return scene, grid
@@ -62,21 +60,12 @@ def from_values(scene: Scene, size: tuple[int, int], values: Tree) -> tuple[Scen
         seen, transform, inputs = given
         seen = check_camera(on_host(seen), None if transform is None else host_value(transform))
         if entry is None:
-            assert is_subclass(type(sampler), TriangleSampler)
             entry = entry_of(part, sampler, map_leaves(host_value, inputs), seen, size)
         entries.append(entry)
         cameras.append(seen)
     parts = [join_record(CheckedPart, ({}, None), (part.surface, part.shader, part.cull)) for part in scene.parts]
     context = Context(engine_of(), np.zeros((), real_of(scene)))
     return Scene(parts, scene.camera, scene.samplers, entries, context, cameras), Grid(on_host(camera), size)
-
-
-@functools.lru_cache(maxsize=4096)
-def _is_drawn(surface: type, sampler: type) -> bool:
-    """True if the triangles of surfaces are all that samplers ask of them, and stay as they are made; for classes."""
-    if not (is_subclass(sampler, TriangleSampler) and is_subclass(surface, TriangleSurface)):
-        return False
-    return not overrides(sampler, "sample", TriangleSampler) and not overrides(sampler, "update", TriangleSampler)
 
 
 def real_of(scene: Scene) -> type:
@@ -99,7 +88,7 @@ def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
     leaves = collected(sampled)
     arrays = dict(zip(map(id, leaves), leaves, strict=True))  # Some stand in it twice, as the cells of a single part.
     moved = dict(zip(arrays, engine.placed(list(arrays.values()), like), strict=True))
-    return map_leaves(functools.partial(next, map(moved.__getitem__, map(id, leaves))), sampled)
+    return map_leaves(partial(next, map(moved.__getitem__, map(id, leaves))), sampled)
 
 
 def _evaluated(part: CheckedPart, samples: Samples, real: type) -> Samples:

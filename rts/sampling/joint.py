@@ -6,7 +6,6 @@ a transform of its vertices, into the camera's space, and a call of its shader, 
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +16,9 @@ import numpy as np
 
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
-from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import is_subclass, overrides
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
-from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler, is_drawn
 from rts.scene.camera import Camera
 
 _VERTICES = attrgetter("vertices")
@@ -86,7 +83,7 @@ class Joint:
             starts.append(starts[-1] + len(proxy.faces))
             ids.append(proxy.faces if proxy.ids is None else proxy.ids)
         sampler, proxy = scene.samplers[first], proxies[0]
-        assert is_subclass(type(sampler), TriangleSampler)
+        assert issubclass(type(sampler), TriangleSampler)
         if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
             proxy = proxy._replace(ids=ids[0]) if proxy.ids is None else proxy
             prepared = scene.entries[first].prepared
@@ -197,18 +194,9 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
 def is_suited(part: CheckedPart, sampler: Any) -> bool:
     """True if a part can be sampled along with others."""
     surface: Any = part.surface
-    return _may_join(type(surface), type(sampler)) and sampler.joins_parts and sampler.concurrent and surface.centered
-
-
-@functools.lru_cache(maxsize=4096)
-def _may_join(surface: type, sampler: type) -> bool:
-    """True if surfaces of a class are no approximation, and samplers of a class leave their samples to this module."""
-    if not is_subclass(sampler, TriangleSampler) or not is_subclass(surface, TriangleSurface):
+    if not (is_drawn(type(surface), type(sampler)) and sampler.joins_parts and sampler.concurrent):
         return False
-    own = overrides(sampler, "update", TriangleSampler) or overrides(sampler, "sample", TriangleSampler)
-    return not (
-        own or overrides(surface, "refine", TriangleSurface) or overrides(surface, "proxy_key", TriangleSurface)
-    )
+    return surface.centered and not surface.refines and not surface.depends_on_view
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.checks import check_ratio, check_sampler, sampler_for_part
+from rts.contracts.records import Sampled
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import is_subclass
@@ -118,18 +119,22 @@ class Grid(NamedTuple):
     cameras: Sequence[Camera] = ()
 
     @classmethod
-    def around(cls, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """The grid of an image of cells (height, width) with an apron."""
-        whole = size[0] + 2 * apron, size[1] + 2 * apron
-        return cls(camera.window(size, (-apron, -apron), whole), whole)
+    def of_samples(cls, sampled: Sampled, parts: Sequence[Part], camera: Camera, context: Context) -> Grid:
+        """The grid of samples of parts that are seen by a camera; see `of_parts`."""
+        height, width = (n - 2 * sampled.apron for n in sampled.row.shape[1:])
+        return cls.of_parts(parts, camera, (height, width), sampled.apron, context)
 
     @classmethod
     def of_parts(
         cls, parts: Sequence[Part], camera: Camera, size: tuple[int, int], apron: int, context: Context
     ) -> Grid:
-        """The grid `around` an image of parts: views are arrays of the context's engine, if it differentiates."""
+        """The grid of an image (height, width) of cells with an apron, in which there are parts.
+
+        The views of cameras are arrays of the context's engine, if it differentiates.
+        """
         # One engine samples every part, through the same matrices that later project the samples.
         if context.engine.differentiates:
             camera = camera.replace(view=context.constants(camera.view))
-        camera, cells = cls.around(camera, size, apron)[:2]
+        cells = size[0] + 2 * apron, size[1] + 2 * apron
+        camera = camera.window(size, (-apron, -apron), cells)
         return cls(camera, cells, [camera.within(part.transform) for part in parts])

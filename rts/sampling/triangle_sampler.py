@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
@@ -15,7 +16,7 @@ from rts.contracts.records import ArraySpec, Fragments, Proxy, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, PluginError
-from rts.plugin_base import overrides
+from rts.plugin_base import is_subclass, overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.sample_checks import check_faces, checked_proxy
@@ -229,6 +230,13 @@ class TriangleSampler(Sampler):
     def draws_at_once(self) -> bool:
         """True if several threads may draw one prepared entry at once."""
         return self.concurrent and not overrides(self, "update", TriangleSampler)
+
+
+@functools.lru_cache(maxsize=4096)
+def is_drawn(surface: type, sampler: type) -> bool:
+    """True if the triangles of surfaces are all that samplers ask of them, and stay as they are made; for classes."""
+    own = overrides(sampler, "sample", TriangleSampler) or overrides(sampler, "update", TriangleSampler)
+    return is_subclass(sampler, TriangleSampler) and is_subclass(surface, TriangleSurface) and not own
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:

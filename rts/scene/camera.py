@@ -253,16 +253,14 @@ class Camera(CameraConverters):
 
     def for_size(self, size: tuple[int, int]) -> Camera:
         """The camera for images of a size (height, width): itself, or a copy of that ratio if `aspect` is "open"."""
-        if self.aspect is None or type(self.aspect) is float:
+        aspect, projection = self.aspect, self.projection
+        if aspect is None or type(aspect) is float or (type(aspect) is not str and isinstance(aspect, Real)):
             return self
-        if not isinstance(self.aspect, str) or self.aspect != "open":
-            if isinstance(self.aspect, Real):
-                return self
-            raise InputError(f"aspect is {quoted(self.aspect)}; expected width over height, 'open' or None")
-        (height, width), projection = check_pixels(size), self.projection
-        aspect = width / height
+        if not (isinstance(aspect, str) and aspect == "open"):
+            raise InputError(f"aspect is {quoted(aspect)}; expected width over height, 'open' or None")
+        height, width = check_pixels(size)
+        aspect, known = width / height, type(projection) is np.ndarray
         columns = np.array([1 / aspect, 1, 1, 1])
-        known = type(projection) is np.ndarray
         columns = columns.astype(projection.dtype) if known else engine_of(projection).constant(columns, projection)
         return self.replace(projection=projection * columns, aspect=aspect)
 

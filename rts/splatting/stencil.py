@@ -92,20 +92,14 @@ def _shape(
 def _forward(operands: Arrays, out: np.ndarray, border: int, supersample: int) -> None:
     import rts.splatting.stencil_loops as loops
 
-    _check(operands)
-    _, colors, front, _, *of_colors = operands[:7]
+    positions, colors, front, _, *of_colors, _, motion_sample, _, motion_colors = operands
+    # Before loops read there.
+    check_rows(front, len(colors))
+    check_rows(of_colors[1], len(colors), "stencil.color_sample")
+    check_rows(motion_colors, len(colors), "stencil.motion_colors")
+    check_rows(motion_sample, len(positions), "stencil.motion_sample")
     work = 2 * out.size * supersample**2
     parallel(loops.value, len(out), border, supersample, colors, front, *of_colors, out, work=work)
-
-
-def _check(operands: Arrays) -> None:
-    """Raise an InputError if an index names no row, before loops read there."""
-    positions, colors, front, _, _, color_sample, _, _, motion_sample, _, motion_colors = operands
-    of_colors = ("row", front), ("stencil.color_sample", color_sample), ("stencil.motion_colors", motion_colors)
-    for name, index in (*of_colors, ("stencil.motion_sample", motion_sample)):
-        count = len(positions if index is motion_sample else colors)
-        if np.minimum.reduce(index, None, initial=0) < -1 or np.maximum.reduce(index, None, initial=-1) >= count:
-            check_rows(index, count, name)  # Tells what is wrong.
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, supersample: int) -> None:

@@ -24,7 +24,7 @@ from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
 from rts.sampling.host_scenes import in_engine
 from rts.sampling.picture import Picture, at_once
-from rts.sampling.scene import Scene
+from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import DrawnView
 from rts.scene.camera import Camera
 from rts.splatting.channels import cropped_image
@@ -197,7 +197,7 @@ def _images_of_scene(
             complete = [_in_engine(picture, scenes[0]) for picture in pictures if picture is not None]
             if len(complete) == len(pictures):
                 return _as_pictures(complete, scenes, context, settings)
-            return _one_by_one(scenes, views, size, context, settings)
+            return _one_by_one(scenes, views, context, settings)
     draw = partial(image_of, size=size, context=context, settings=settings)
     images = [draw(scene) for scene in (scenes[:1] if several and not differentiates else scenes)]
     if len(images) < len(scenes):
@@ -228,18 +228,13 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
-def _one_by_one(
-    scenes: Sequence[Scene],
-    views: Sequence[Sampled],
-    size: tuple[int, int],
-    context: Context,
-    settings: RenderSettings,
-) -> Array:
+def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
     images, splatter = [], settings.splatter
     assert splatter is not None
     for sampled, scene in zip(views, scenes, strict=True):
-        images.append(splatted(sampled, scene, settings.grid(scene, scene.camera, size), context, splatter))
+        grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
+        images.append(splatted(sampled, scene, grid, context, splatter))
     return namespace(*images).stack(images)
 
 

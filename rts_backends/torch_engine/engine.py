@@ -106,11 +106,7 @@ class TorchEngine(Engine):
 
     def devices(self, arrays: Iterable[Any]) -> set[torch.device]:
         """The devices of the tensors. Single numbers on the CPU count for nothing: torch takes them beside any."""
-        devices = set()
-        for x in arrays:
-            if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu):
-                devices.add(x.device)
-        return devices
+        return {x.device for x in arrays if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu)}
 
     def product(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         """See `Engine.product`: by elements on devices, whose matrix units may be set to round, and in `autocast`.
@@ -144,9 +140,8 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if is_dynamo_compiling() or (type(x) is not torch.Tensor and is_compiling()):
-            return None
-        if torch_internals.is_legacy_batchedtensor(x):
+        traced = is_dynamo_compiling() or (type(x) is not torch.Tensor and is_compiling())
+        if traced or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)

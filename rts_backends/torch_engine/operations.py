@@ -72,9 +72,7 @@ class _Call(SimpleNamespace):
     call of its own.
     """
 
-    operation: Operation
-    params: Mapping[str, Any]
-    kept: Any = None
+    kept = None
 
     def another(self) -> _Call:
         """A call of this operation with these parameters, at other operands."""

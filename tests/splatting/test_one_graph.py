@@ -32,7 +32,7 @@ def splats(splatter, size):
     sampled = rts.sample(parts, camera, size, splatter=splatter, layers=layers)
     scene = Scene.of(parts, camera, "auto", None).at(size)
     context = scene.context_with(sampled)
-    grid = Grid.of_parts(scene.parts, scene.camera, size, sampled.apron, context)
+    grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
     found = to_splats(sampled, scene.parts, scene.camera, grid, context)
     return map_leaves(lambda x: x.detach(), found)
 
