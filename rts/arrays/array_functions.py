@@ -143,7 +143,8 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar products (…, 1) of short vectors (…, C)."""
-    engine, products = engine_of(a, b), a * b
+    products = a * b
+    engine = OWNERS.get(type(products)) or engine_of(a, b)
     if engine.differentiates:
         return engine.namespace.sum(products, axis=-1, keepdims=True)
     # NumPy takes ten times as long to sum along short axes.

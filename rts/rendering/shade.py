@@ -107,10 +107,13 @@ def shade(
         camera: the camera of the whole image, or of each sample.
         engine: the engine to compute with.
     """
-    world = _to_world(_readable(local, samples, engine) if engine.padded(samples.row) else local, transform)
+    padded = engine.padded(samples.row)
+    # Unused rows hold values with finite derivatives for the shader, too.
+    changes = dict.fromkeys(local, lambda x: engine.fill_unused(x, samples.row)) if padded else {}
+    world = _to_world(local.changed(changes) if padded else local, transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform:  # One colour, however many rows are in use.
+    if part.uniform or not padded:  # One colour, however many rows are in use; or all are.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):
@@ -198,11 +201,6 @@ def _colors(
         if name not in local:
             local.defer(name, unread)
     return _shaded(part, theta, _to_world(local, transform), camera)
-
-
-def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
-    """The G-buffer for shaders: unused rows hold values with finite derivatives, too."""
-    return gbuffer.changed(dict.fromkeys(gbuffer, lambda x: engine.fill_unused(x, samples.row)))
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:
