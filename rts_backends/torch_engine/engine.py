@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.utils.checkpoint
-from torch.compiler import is_compiling, is_dynamo_compiling
+from torch.compiler import is_dynamo_compiling
 from torch.utils import _pytree
 
 from rts import Engine, InputError
@@ -140,8 +140,7 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        traced = is_dynamo_compiling() or (type(x) is not torch.Tensor and is_compiling())
-        if traced or torch_internals.is_legacy_batchedtensor(x):
+        if is_dynamo_compiling() or torch_internals.exporting() or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)
@@ -153,7 +152,7 @@ class TorchEngine(Engine):
 
     def are_known(self, arrays: Iterable[torch.Tensor]) -> bool:
         """See `Engine.are_known`."""
-        if torch_internals.current_level() is not None or is_compiling():
+        if torch_internals.current_level() is not None or is_dynamo_compiling() or torch_internals.exporting():
             return super().are_known(arrays)
         return not any(map(torch_internals.is_legacy_batchedtensor, arrays))
 

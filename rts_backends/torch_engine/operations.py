@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.compiler import is_compiling, is_dynamo_compiling
+from torch.compiler import is_dynamo_compiling
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
@@ -37,10 +37,10 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     `torch.compile`, and while other array code is differentiated.
     """
     real = operands[0].dtype
-    compiled = real in _DTYPES and not _specifying.on and not is_dynamo_compiling()
+    traced = is_dynamo_compiling() or torch_internals.exporting()
+    compiled = real in _DTYPES and not _specifying.on and not traced
     for x in operands:
         compiled = compiled and x.is_cpu and (x.dtype == real or x.dtype in _INTEGERS)
-        compiled = compiled and (type(x) is Tensor or not is_compiling())
     if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.

@@ -7,6 +7,7 @@
 - `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
   alone are wanted.
 - `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
+- `exporting` tells whether `torch.export` traces.
 - `eagerly` calls a `Function` outside of transforms without a look at each argument in Python; `unwrap_if_dead` finds
   what is left over from transforms that have ended.
 
@@ -104,6 +105,12 @@ def is_asked_for(ctx: Any, k: int) -> bool:
 
 forward_level = partial(getattr, forward_ad, "_current_level", 0)
 """() → the level of forward mode, negative where it is off; 0 from a torch that does not tell."""
+
+
+exporting = torch.compiler.is_compiling
+if hasattr(torch.compiler, "_is_compiling_flag"):
+    exporting = partial(getattr, torch.compiler, "_is_compiling_flag")
+"""() → whether `torch.export` traces; `torch.compiler.is_dynamo_compiling` tells whether `torch.compile` does."""
 
 
 def eagerly(function: type[torch.autograd.Function]) -> Callable:
