@@ -29,11 +29,12 @@ def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, gr
         sampled: the samples.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
-        grid: the cells of the samples, with the camera in the local space of each part.
+        grid: the cells of the samples: those of the image, or a window of it, through the same view.
         context: the engine to compute with, and an exemplar of its constants and of the splats.
     """
     inputs, engine = of_inputs(context), context.engine
-    sampled, camera = owned(sampled, sampled.row, context), context.constants(camera)
+    sampled, projection = owned(sampled, sampled.row, context), context.constants(camera.projection)
+    camera = camera.replace(view=context.constants(grid.camera.view), projection=projection)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled.samples, strict=True)):
         theta, transform = theta_of(part, inputs), inputs.constants(part.transform)

@@ -38,6 +38,8 @@ FEW = 16
 """The most products of a sum that are made one by one."""
 
 _CPU = torch.device("cpu")
+_cast = np.errstate(over="ignore")(np.ndarray.astype)
+"""`astype`, by which too large numbers become infinite."""
 
 _sent: dict[tuple[int, torch.device], tuple[weakref.ref, torch.Tensor]] = {}
 """Read-only tables of the host by identity and device, and their tensors there."""
@@ -65,10 +67,11 @@ class TorchEngine(Engine):
         they live: their numbers must stay, and nobody may change the result in place.
         """
         array, device = np.asarray(value), _CPU if like is None else like.device
-        wide = like is not None and like.dtype is torch.float64
-        if array.dtype.kind == "f" and array.dtype != (np.float64 if wide else np.float32):
-            # Too large numbers become infinite.
-            return torch.tensor(array, dtype=torch.float64 if wide else torch.float32, device=device)
+        dtype = np.float64 if like is not None and like.dtype is torch.float64 else np.float32
+        if array.dtype.kind == "f" and array.dtype != dtype:
+            array = _cast(array, dtype, "C")  # torch takes longer for a matrix.
+            if device.type == "cpu":
+                return torch.from_numpy(array)
         if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)
         key = id(array), device
