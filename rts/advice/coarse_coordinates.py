@@ -56,7 +56,7 @@ def warn_of_coarse_coordinates(
     if max(size) > LARGEST_SIDE:
         return  # It is refused later: no memory holds such an image.
     for index, part in enumerate(parts):
-        surface = part.surface
+        surface: Any = part.surface
         if not is_subclass(type(surface), TriangleSurface) or not is_new(surface, _looked_at):
             continue
         inputs = surface.proxy_inputs(stopped(part.theta))

@@ -83,6 +83,7 @@ class ViewTransforms:
         sign = _cofactors(self.matrices)[1][..., 0]
         return namespace(moved).concat([moved, tangents[:, 3:] * take(sign, index_of_views(self.view))], axis=1)
 
+
 def _linear(matrix: Array) -> Array:
     """Linear maps (..., 3, 3) as affine ones (..., 3, 4)."""
     xp = namespace(matrix)

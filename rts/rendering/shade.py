@@ -120,8 +120,12 @@ def shade(
         rows[NUMBER] = camera.number
 
     def few(rows: dict[str, Array]) -> Array:
+        """The colours of some rows of the attributes that the shader has read in its first call, in local space."""
         row_cameras = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
-        return _colors(part, theta, transform, row_cameras, names, rows)
+        few_local = GBuffer(rows)
+        for name in set(names) - set(rows):
+            few_local.defer(name, _unread)
+        return _shaded(part, theta, _to_world(few_local, transform), row_cameras)
 
     with suppress(_UnreadError):
         rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
@@ -171,36 +175,8 @@ class _UnreadError(Exception):
     """A shader reads an attribute that it did not read in its first call."""
 
 
-def _colors(
-    part: CheckedPart,
-    theta: Mapping[str, Tree],
-    transform: Array | ViewTransforms | None,
-    camera: Camera | RowCameras,
-    names: Sequence[str],
-    attributes: Mapping[str, Array],
-) -> Array:
-    """The colours (n, C + 1) that a part's shader gives for n rows of the attributes that it has read.
-
-    Args:
-        part: the part.
-        theta: the result of `theta_of`.
-        transform: the part's transform, or None.
-        camera: the camera of the whole image, or of each row.
-        names: all attributes that the part has.
-        attributes: those that the shader read in its first call, (n, ·) each, local space.
-
-    Raises:
-        _UnreadError: the shader reads another one of `names` now.
-    """
-
-    def unread() -> Array:
-        raise _UnreadError
-
-    local = GBuffer(attributes)
-    for name in names:
-        if name not in local:
-            local.defer(name, unread)
-    return _shaded(part, theta, _to_world(local, transform), camera)
+def _unread() -> Array:
+    raise _UnreadError
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:

@@ -55,8 +55,8 @@ def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, gr
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
         positions, colors = context_of(positions, colors).constants((positions, colors))
-    cells = {"border": sampled.apron, "supersample": sampled.supersample}
-    return splats_of(sampled, parts, *concatenated(positions, colors), context, **cells)
+    placed, rgba = concatenated(positions, colors)
+    return splats_of(sampled, parts, placed, rgba, context, border=sampled.apron, supersample=sampled.supersample)
 
 
 def owned(tree: Tree, row: Array, context: Context) -> Tree:

@@ -179,7 +179,8 @@ class HostCall:
     def _packed(self, by_sample: Sequence[str], attributes: Mapping[str, Array] | None, *fields: Any) -> Samples:
         """Samples of the part with these fields, the first five; tables of these names have a row for each sample."""
         gbuffer, centered = None if self._theta is None else attributes, self._surface.centered
-        return Samples(*fields, gbuffer, self._reads, centered, tuple(by_sample))
+        ids, params, cells, overflow, tables = fields
+        return Samples(ids, params, cells, overflow, tables, gbuffer, self._reads, centered, tuple(by_sample))
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import repeat
 from operator import is_not
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,7 @@ def from_values(scene: Scene, size: tuple[int, int], values: Tree) -> tuple[Scen
     An InputError if a camera makes no image.
     """
     entries, cameras, (camera, of_parts) = [], [], values
+    sampler: Any
     for part, sampler, entry, given in zip(scene.parts, scene.samplers, scene.entries, of_parts, strict=True):
         seen, transform, inputs = given
         seen = check_camera(on_host(seen), None if transform is None else host_value(transform))

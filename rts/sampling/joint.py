@@ -82,8 +82,8 @@ class Joint:
         for proxy in proxies:
             starts.append(starts[-1] + len(proxy.faces))
             ids.append(proxy.faces if proxy.ids is None else proxy.ids)
-        sampler, proxy = scene.samplers[first], proxies[0]
-        assert issubclass(type(sampler), TriangleSampler)
+        sampler: Any = scene.samplers[first]
+        proxy = proxies[0]
         if len(proxies) == 1 and vertices[0] is proxy.vertices:  # Nothing moves, and nothing is copied.
             proxy = proxy._replace(ids=ids[0]) if proxy.ids is None else proxy
             prepared = scene.entries[first].prepared
@@ -188,7 +188,9 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
     for (joins, *_), run in groups:
         numbers = list(run)
         for several in [numbers] if joins else [[number] for number in numbers if len(proxies[number].faces)]:
-            yield Joint.of(scene, several[0], list(map(proxies.get, several)), list(map(cameras.get, several)))
+            yield Joint.of(
+                scene, several[0], list(map(proxies.__getitem__, several)), list(map(cameras.__getitem__, several))
+            )
 
 
 def is_suited(part: CheckedPart, sampler: Any) -> bool:

@@ -170,11 +170,6 @@ def _drawn_at_once(views: Sequence[DrawnView], context: Context, settings: Rende
     return _as_pictures(pictures, [view.scene for view in views], context, settings)
 
 
-def _cells(size: tuple[int, int], settings: RenderSettings) -> tuple[int, int]:
-    """(height, width) of an image in cells."""
-    return settings.supersample * size[0], settings.supersample * size[1]
-
-
 def _images_of_scene(
     scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings
 ) -> Array:
@@ -183,7 +178,7 @@ def _images_of_scene(
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
     if settings.layers != "auto" and len(settings.bands(size)) == 1:
-        height, width = (n + 2 * settings.apron for n in _cells(size, settings))
+        height, width = (settings.supersample * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         # Which rows are in use is unknown if they are padded, so that one call must serve all views.

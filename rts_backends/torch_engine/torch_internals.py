@@ -78,9 +78,9 @@ except ImportError:
         """0, as if some transform were active."""
         return 0
 
-    def unwrap_if_dead(x: Tensor) -> Tensor:
+    def unwrap_if_dead(tensor: Tensor) -> Tensor:
         """The tensor itself: `Function.apply` looks for what is left over from transforms."""
-        return x
+        return tensor
 
     def is_legacy_batchedtensor(tensor: Tensor) -> bool:
         """True for a tensor without values, where no transform has wrapped it."""
