@@ -293,9 +293,7 @@ def stopped(tree: Tree) -> Tree:
     owner = OWNERS.get(type(tree))
     if owner is not None:
         return owner.stop_gradient(tree)
-    return map_leaves(
-        lambda x: x if isinstance(x, CONSTANT_TYPES) else (OWNERS.get(type(x)) or engine_of(x)).stop_gradient(x), tree
-    )
+    return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

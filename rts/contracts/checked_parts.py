@@ -126,7 +126,7 @@ def _check_part(index: int, part: Part) -> CheckedPart:
         transform = check_matrix(f"the transform of part {index}", transform)
     surface.check(theta)
     reads = surface.reads(theta)
-    if isinstance(reads, str) or not set(reads) <= set(theta):
+    if isinstance(reads, str) or not set(reads := tuple(reads)) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     checked = join_record(CheckedPart, (theta, transform), (surface, shader, part.cull))
     # Known now, and asked for at each stage.

@@ -78,9 +78,8 @@ class RenderSettings:
             layers = TRACED_LAYERS[opaque]
         if most is not None:
             layers = most if layers == "auto" else min(most, int(layers))
-        if layers == self.layers:
-            return self
-        return RenderSettings(splatter, layers, self.supersample, self.capacity, self.fronts)
+        given = self.supersample, self.capacity, self.fronts
+        return self if layers == self.layers else RenderSettings(splatter, layers, *given)
 
     @property
     def finds_outlines(self) -> bool:

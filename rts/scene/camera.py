@@ -260,8 +260,8 @@ class Camera(CameraConverters):
             raise InputError(f"aspect is {quoted(aspect)}; expected width over height, 'open' or None")
         height, width = check_pixels(size)
         aspect, known = width / height, type(projection) is np.ndarray
-        columns = np.array([1 / aspect, 1, 1, 1])
-        columns = columns.astype(projection.dtype) if known else engine_of(projection).constant(columns, projection)
+        columns = np.array([1 / aspect, 1, 1, 1], projection.dtype if known else None)
+        columns = columns if known else engine_of(projection).constant(columns, projection)
         return self.replace(projection=projection * columns, aspect=aspect)
 
     def map(self, f: Callable[[Array], Array]) -> Camera:
