@@ -164,8 +164,8 @@ def _by_bands(
         return draw(_sampled(scene, grid, settings), grid)
     drawn = []
     for top, rows in bands:
-        window = rows, size[1]
-        grid = settings.grid(scene, scene.camera.window(size, (top, 0), window), window)
+        window = scene.camera.window(size, (top, 0), (rows, size[1]))
+        grid = settings.grid(scene, window, (rows, size[1]))
         take = partial(_sampled, scene, grid, settings)
         drawn.append(context.engine.checkpoint(take, lambda s, g=grid: draw(s, g)))
     return tuple(namespace(*arrays).concat(arrays) for arrays in zip(*drawn, strict=True))
