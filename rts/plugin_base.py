@@ -26,6 +26,10 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
 """Promise → the methods whose behaviour it describes; a class may lack some of them."""
 
 
+is_subclass = functools.lru_cache(maxsize=4096)(issubclass)
+"""`issubclass`, kept: Python searches abstract bases in Python code, each time."""
+
+
 def overrides(plugin: Any, method: str, base: type) -> bool:
     """True if a plugin, or a class of plugins, subclasses the base and overrides a method of the base."""
     return _overrides(plugin if isinstance(plugin, type) else type(plugin), method, base)
@@ -33,7 +37,7 @@ def overrides(plugin: Any, method: str, base: type) -> bool:
 
 @functools.lru_cache(maxsize=4096)
 def _overrides(kind: type, method: str, base: type) -> bool:
-    return issubclass(kind, base) and getattr(kind, method, None) is not getattr(base, method, None)
+    return is_subclass(kind, base) and getattr(kind, method, None) is not getattr(base, method, None)
 
 
 def promised(plugin: Any, name: str) -> Any:

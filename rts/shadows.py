@@ -85,13 +85,15 @@ def _picture(
 ) -> DepthPicture:
     """The picture of parts that have one number of layers."""
     scene = Scene.of(parts, camera, sampler, engine).at(size)
-    sampled = sampled_scene(scene, scene.camera, size, RenderSettings(None, layers, 1, capacity), one_shader=False)
+    settings = RenderSettings(None, layers, 1, capacity).of(scene)
+    grid = settings.grid(scene, scene.camera, size)
+    sampled = sampled_scene(scene, grid, settings, one_shader=False)
     opaque, context = all(scene.opaque), scene.context
     if opaque and not context.engine.differentiates:
         depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
         # Nothing moves, so that one sample stands for all.
         return picture_of(depth, context.engine.constant(np.zeros((1, 3)), depth), row, place, size, opaque)
-    splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
+    splats = to_splats(sampled, scene.parts, scene.camera, grid, context)
     positions, row, engine = splats.positions, splats.row, engine_of(splats.positions)
     depth, place = constants((stopped(sampled.depth), scene.camera), engine, positions)
     if not positions.shape[0]:

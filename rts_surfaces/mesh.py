@@ -182,7 +182,7 @@ class Mesh(TriangleSurface):
         if not self._looked_at:
             self._looked_at = True
             smooth.warn_of_windings(self.faces)
-        if exemplar(vertices) is None:
+        if isinstance(vertices, np.ndarray):
             normals, cancelled = self._vertex_normals(vertices)
             found = self._interpolate(normals, samples, 0)
             if not cancelled.any():

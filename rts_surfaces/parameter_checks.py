@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rts import InputError, namespace
-from rts.plugin_api.arrays import Tree, shape_of
+from rts.plugin_api.arrays import Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color", "tangents": "tangent"}
 """Entry of θ → its name in the G-buffer, where the two differ."""
@@ -36,7 +36,7 @@ def check_entry(
     """
     if name not in theta:
         raise InputError(f"theta of {who} has no {name!r}; it has {sorted(theta)}")
-    value, wrong = theta[name], expected(shape_of(theta[name]))
+    value, wrong = theta[name], expected(tuple(getattr(theta[name], "shape", ())))
     if wrong is not None:
         what = f"has shape {tuple(value.shape)}" if hasattr(value, "shape") else f"is a {type(value).__name__}"
         raise InputError(f"theta[{name!r}] of {who} {what}; expected {wrong}")

@@ -15,6 +15,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Proxy
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
+from rts.plugin_base import is_subclass
 from rts.scene.camera import Camera
 
 LOOKED_AT = 1 << 16
@@ -55,8 +56,8 @@ def warn_of_coarse_coordinates(
     if max(size) > LARGEST_SIDE:
         return  # It is refused later: no memory holds such an image.
     for index, part in enumerate(parts):
-        surface = part.surface
-        if not isinstance(surface, TriangleSurface) or not is_new(surface, _looked_at):
+        surface: Any = part.surface
+        if not is_subclass(type(surface), TriangleSurface) or not is_new(surface, _looked_at):
             continue
         inputs = surface.proxy_inputs(stopped(part.theta))
         transform = np.eye(4) if part.transform is None else part.transform

@@ -63,6 +63,8 @@ def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | 
 def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
     """Warn of unread entries of θ whose names almost match one that would be read; built-in names cause no warning."""
     for index, part in enumerate(parts):
+        if len(part.read) == len(part.theta):
+            continue
         shaded = shaded_by(part)
         for name in unread(part, None if shaded is None else shaded - OF_MAPS):
             if name in SURFACE_ENTRIES or name in SHADER_ENTRIES:

@@ -25,8 +25,9 @@ def known_tree(tree: Tree) -> Tree | None:
 def is_new(surface: Any, seen: weakref.WeakSet[Any]) -> bool:
     """True for a surface that is not among those `seen`, where it is from now on."""
     try:
-        new = surface not in seen
+        if surface in seen:
+            return False
         seen.add(surface)
     except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
         return False
-    return new
+    return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -38,12 +39,14 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         return tree if owner.plain(tree) else owner.admitted(tree, name)
     if tree is None or kind in _NUMBERS:
         return tree
-    if isinstance(tree, Mapping):
+    if kind is dict or isinstance(tree, Mapping):
         entries = {}
         for key, value in tree.items():
             if not isinstance(key, str):
                 raise InputError(f"{name} has the key {key!r}; expected names")
-            entries[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
+            owner = OWNERS.get(type(value))
+            plain = type(value) is np.ndarray and value.dtype in _ORDINARY if owner is None else owner.plain(value)
+            entries[key] = value if plain else from_numbers(value, f"{name}[{key!r}]")
         return entries
     if isinstance(tree, (list, tuple)):
         numbers = [isinstance(x, (bool, int, float)) for x in leaves(tree)]
@@ -69,14 +72,6 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         what = " ".join(repr(tree).split())
         raise InputError(f"{name} is {what if len(what) <= 60 else kind_of(tree)}; expected an array") from None
     return engine.admitted(tree, name)
-
-
-def _is_plain(x: Any) -> bool:
-    """True for an array that needs no conversion."""
-    if type(x) is np.ndarray:
-        return x.dtype in _ORDINARY
-    owner = OWNERS.get(type(x))
-    return owner is not None and owner.plain(x)
 
 
 _NUMBERS = (bool, int, float)
@@ -148,7 +143,8 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar products (…, 1) of short vectors (…, C)."""
-    engine, products = engine_of(a, b), a * b
+    products = a * b
+    engine = OWNERS.get(type(products)) or engine_of(a, b)
     if engine.differentiates:
         return engine.namespace.sum(products, axis=-1, keepdims=True)
     # NumPy takes ten times as long to sum along short axes.
@@ -168,17 +164,16 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
     """
     for x in arrays:
         engine = OWNERS.get(type(x)) or engine_of(x)
-        if not engine.on_host(x):
+        values = engine.at_hand(x)
+        if values is None and not engine.on_host(x):
             below_all = value_of(engine.namespace.all(abs(x) < below))
             if below_all is not None and not below_all.all():
                 return False
-            continue
-        values = engine.known(x)
         if values is None or not values.size:
             continue
         # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
         if 0 in values.strides:
-            values = values[tuple([slice(None) if step else slice(1) for step in values.strides])]
+            values = values[tuple(map({0: slice(1)}.get, values.strides, repeat(slice(None))))]
         if not largest_absolute(values) < below:
             return False
     return True

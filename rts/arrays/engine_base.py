@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -134,6 +135,26 @@ class Engine(Plugin):
         Under transforms of batches the value may have more axes than the array.
         """
         return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
+
+    def at_hand(self, x: Array) -> np.ndarray | None:
+        """The value of an array in the host's memory; None if it is on another device, or traced."""
+        return self.known(x) if self.on_host(x) else None
+
+    def are_known(self, arrays: Iterable[Array]) -> bool:
+        """True if no array is traced, and no transform maps over several values of one."""
+        for x in arrays:
+            # On another device an empty part of it is looked at, so that nothing crosses.
+            value = self.known(x[:0, ...] if len(x.shape) and not self.on_host(x) else x)
+            if value is None or value.ndim != len(x.shape):
+                return False
+        return True
+
+    def placed(self, arrays: Sequence[np.ndarray], like: Array | None) -> Sequence[Array]:
+        """Arrays of the host, which nobody writes to any more, on the device of `like`; their dtypes stay."""
+        specs = [SimpleNamespace(shape=x.shape, dtype=x.dtype, packed=False, by_sample=False) for x in arrays]
+        # None of its numbers cross: it only says where to.
+        place = [] if like is None else [self.namespace.reshape(like, (-1,))[:0]]
+        return self.call_host(lambda *_: arrays, specs, *place)
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
         """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.

@@ -151,7 +151,7 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
         InputError: `engine` is no name of an engine.
         EngineError: arrays of two engines, of another one than `engine`, or on two devices.
     """
-    scene_engine, like = context_of(parts, *others)
+    scene_engine, like = context = context_of(parts, *others)
     if engine is not None:
         if not isinstance(engine, str):
             raise InputError(f"engine is a {type(engine).__name__}; expected a name, such as 'torch' or 'jax'")
@@ -162,7 +162,7 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
             )
         scene_engine = wanted
     if like is not None:
-        return Context(scene_engine, like)
+        return context
     thetas = collected([part.theta for part in parts])
     is_wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
     if scene_engine.name == "numpy":
@@ -216,7 +216,8 @@ def uncompiled(f: _F) -> _F:
     def call(*args: Any, **kwargs: Any) -> Any:
         outside = f
         for engine in load_engines():
-            outside = engine.uncompiled(outside)
+            if type(engine).uncompiled is not Engine.uncompiled:
+                outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]  # The wrapper has the type of `f`.
@@ -260,7 +261,7 @@ def _widest(arrays: Sequence[Any]) -> Array | None:
     for x in arrays:
         if isinstance(x, CONSTANT_TYPES):
             continue
-        width = floating_bits(x)
+        width = _BITS.get(x.dtype) or floating_bits(x)
         if width > bits:
             widest, bits = x, width
     return widest

@@ -12,7 +12,7 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers
 from rts.arrays.engines import value_of
-from rts.arrays.trees import Array, Tree, record
+from rts.arrays.trees import Array, Tree, join_record, record
 from rts.contracts.checks import check_matrix, check_shader, check_surface, is_count
 from rts.contracts.shader import Shader
 from rts.contracts.surface import Surface
@@ -109,7 +109,9 @@ def _check_camera(camera: Camera) -> Camera:
     projection = check_matrix("the camera's projection", camera.projection)
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
-    sign = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])
+    if isinstance(projection, np.ndarray):
+        return camera.turned() if projection[3, 2] > 0 else camera
+    sign = value_of(projection[3, 2])
     return camera.turned() if sign is not None and (sign > 0).all() else camera
 
 
@@ -124,9 +126,13 @@ def _check_part(index: int, part: Part) -> CheckedPart:
         transform = check_matrix(f"the transform of part {index}", transform)
     surface.check(theta)
     reads = surface.reads(theta)
-    if isinstance(reads, str) or not set(reads) <= set(theta):
+    if isinstance(reads, str) or not set(reads := tuple(reads)) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
-    return CheckedPart(surface, theta, shader, transform, part.cull)
+    checked = join_record(CheckedPart, (theta, transform), (surface, shader, part.cull))
+    # Known now, and asked for at each stage.
+    read = dict(zip(reads, map(theta.get, reads), strict=True))
+    checked.__dict__.update(read=read, reads=promised(shader, "reads"), uniform=promised(shader, "uniform"))
+    return checked
 
 
 def check_channels(parts: Sequence[CheckedPart]) -> int:

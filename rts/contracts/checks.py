@@ -19,7 +19,7 @@ from rts.contracts.shader import FunctionShader, Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import RaySurface, Surface, TriangleSurface
 from rts.errors import AspectWarning, InputError, PluginError, warn, warn_deprecated
-from rts.plugin_base import check_members
+from rts.plugin_base import check_members, is_subclass
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -37,6 +37,8 @@ def _memory() -> float:
 
 MEMORY = _memory()
 
+_REAL = {np.dtype(np.float32), np.dtype(np.float64)}
+
 BRIGHTEST = 1e30
 """The size that colours stay below: derivatives of sums of larger ones overflow float32."""
 
@@ -49,7 +51,7 @@ def check_sampler(sampler: Any) -> Sampler:
 def sampler_for_part(sampler: Sampler, part: Part, camera: Camera | None) -> Sampler:
     """The sampler that `sampler` selects for a part: `sampler` itself or another."""
     selected = sampler.sampler_for(part, camera)
-    return selected if selected is sampler else check_sampler(selected)
+    return selected if selected is sampler else checked_plugin(selected, "the sampler", Sampler)
 
 
 def check_splatter(splatter: Any) -> Splatter:
@@ -65,15 +67,10 @@ def check_splatter(splatter: Any) -> Splatter:
     return splatter
 
 
-def is_auto(value: Any) -> bool:
-    """True for the name "auto"."""
-    return isinstance(value, str) and value == "auto"
-
-
 def check_shader(shader: Any, what: str) -> Shader:
     """A usable shader from a name, a class, an object or a function; `what` names it."""
     shader = registry.instance("rts.shaders", shader)
-    shader = FunctionShader(shader) if callable(shader) and not isinstance(shader, Shader) else shader
+    shader = FunctionShader(shader) if not is_subclass(type(shader), Shader) and callable(shader) else shader
     return checked_plugin(shader, what, Shader, "a function, ")
 
 
@@ -81,7 +78,7 @@ def check_surface(surface: Any, what: str) -> Surface:
     """The surface of a part, refused if its class has no base of surfaces; `what` names it."""
     checked_plugin(surface, what, Surface, "such as a mesh, ")
     for base, method in ((TriangleSurface, "proxy"), (RaySurface, "intersect")):
-        if hasattr(surface, method) and not isinstance(surface, base):
+        if hasattr(surface, method) and not is_subclass(type(surface), base):
             raise PluginError(f"{type(surface).__qualname__} has the methods of rts.{base.__name__}; subclass that")
     return surface
 
@@ -99,7 +96,7 @@ def checked_plugin(plugin: Any, what: str, base: type, others: str = "a name, ")
         InputError: its class does not subclass `base`.
         PluginError: its class overrides a final method, or has a function named almost like an optional one.
     """
-    if not isinstance(plugin, base):
+    if not is_subclass(type(plugin), base):
         bases = "rts.TriangleSurface or rts.RaySurface" if base is Surface else f"rts.{base.__name__}"
         raise InputError(f"{what} is {quoted(plugin)}; expected {others}or an object whose class subclasses {bases}")
     check_members(type(plugin))
@@ -108,14 +105,16 @@ def checked_plugin(plugin: Any, what: str, base: type, others: str = "a name, ")
 
 def check_matrix(name: str, matrix: Any) -> Array:
     """A (4, 4) matrix of floating numbers: lists become float32, NumPy integers float64. Other arrays are refused."""
-    matrix = from_numbers(matrix, name)
+    if type(matrix) is not np.ndarray or matrix.dtype not in _REAL:
+        matrix = from_numbers(matrix, name)
     if getattr(matrix, "shape", ()) != (4, 4):
         several = len(shape_of(matrix)) == 3 and shape_of(matrix)[1:] == (4, 4)
         hint = "; for several views call rts.render_views, for several poses vmap of rts.render" if several else ""
         raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array{hint}")
     if isinstance(matrix, np.ndarray):
         return matrix if matrix.dtype.kind == "f" else matrix.astype(np.float64)
-    check_floating(name, matrix)
+    if not floating_bits(matrix):
+        check_floating(name, matrix)
     return matrix
 
 
@@ -138,7 +137,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     Also allowed are `layers="auto"` and a capacity of None.
     """
     height, width = check_pixels(size)
-    if not is_auto(layers) and not is_count(layers):
+    if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
         raise InputError(f'layers is {quoted(layers)}; expected an integer of at least 1, or "auto"')
     if capacity is not None and not is_count(capacity):
         raise InputError(f"capacity is {quoted(capacity)}; expected an integer of at least 1, or None")

@@ -35,17 +35,13 @@ class GBuffer(dict):
     def check(self, check: Callable[[str, Any], None]) -> None:
         """Check all attributes by `check(name, attribute)`, deferred ones once they are computed."""
         self._check = check
-        for name, value in self.computed.items():
+        for name, value in super().items():
             check(name, value)
 
     @property
     def like(self) -> Any:
         """An array (N, ·), a row for each sample, for its dtype and device, where no attribute is needed."""
         return self["position"] if self._like is None else self._like
-
-    @like.setter
-    def like(self, value: Any) -> None:
-        self._like = value
 
     @property
     def computed(self) -> dict[str, Any]:
@@ -59,7 +55,7 @@ class GBuffer(dict):
     def changed(self, changes: Mapping[str, Callable[[Any], Any]]) -> GBuffer:
         """A G-buffer of the same attributes, of which `changes` turns some into others; all are computed when read."""
         other = GBuffer()
-        other.like = self.like
+        other._like = self["position"] if self._like is None else self._like
         for name in self:
             read, change = partial(self.__getitem__, name), changes.get(name)
             other._deferred[name] = read if change is None else lambda read=read, change=change: change(read())

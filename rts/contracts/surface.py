@@ -8,7 +8,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, final
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import ArraySpec, Proxy, RayHits, Samples
 from rts.errors import InputError
-from rts.plugin_base import Plugin, overrides
+from rts.plugin_base import Plugin
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rays import Rays
@@ -132,23 +132,21 @@ class TriangleSurface(Surface):
         refine_moves: whether `refine` moves samples or drops them. If it only adds tables or params, hidden samples are
             dropped before `refine` is called.
         face_count: the number of triangles, or None if unknown beforehand; by it the sampler "auto" chooses a sampler.
+        refines: whether `refine` is overridden, so that samples on the triangles pass through it; not to be set.
+        depends_on_view: whether `proxy_key` is, so that the triangles depend on camera and size; not to be set.
     """
 
     proxy_is_cheap: bool = False
     refine_moves: bool = True
     face_count: int | None = None
 
-    @property
-    @final
-    def refines(self) -> bool:
-        """True if `refine` is overridden, so that samples on the triangles pass through it."""
-        return overrides(self, "refine", TriangleSurface)
+    refines: ClassVar[bool] = False
+    depends_on_view: ClassVar[bool] = False
 
-    @property
-    @final
-    def depends_on_view(self) -> bool:
-        """True if `proxy_key` is overridden: the triangles depend on camera and size."""
-        return overrides(self, "proxy_key", TriangleSurface)
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.refines = cls.refine is not TriangleSurface.refine
+        cls.depends_on_view = cls.proxy_key is not TriangleSurface.proxy_key
 
     @abc.abstractmethod
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:

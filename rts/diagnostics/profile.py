@@ -146,7 +146,7 @@ def profile(
         return result, times[0], statistics.median(times[1:])
 
     def sampled_with(settings: RenderSettings) -> Sampled:
-        return sampled_scene(scene, scene.camera, size, settings)
+        return sampled_scene(scene, settings.grid(scene, scene.camera, size), settings)
 
     stages = []
     if settings.finds_outlines:
@@ -161,7 +161,8 @@ def profile(
         stages.append(StageTime(OUTLINES, *spent, count, _megabytes(found)))
     else:
         stages.append(StageTime(SAMPLING, whole_first, whole_later, _rows(sampled), _megabytes(sampled)))
-    splats, first, later = timed(lambda: to_splats(sampled, scene.parts, scene.camera, scene.camera, context))
+    grid = settings.grid(scene, scene.camera, size)
+    splats, first, later = timed(lambda: to_splats(sampled, scene.parts, scene.camera, grid, context))
     stages.append(StageTime(SHADING, first, later, splats.rgba.shape[0], _megabytes((splats.positions, splats.rgba))))
     image, first, later = timed(lambda: cropped_image(chosen, splats))
     stages.append(StageTime(SPLATTING, first, later, size[0] * size[1], _megabytes(image)))

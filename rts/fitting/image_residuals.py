@@ -44,7 +44,7 @@ from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import owned, splats_of, to_splats
 from rts.sampling.prepared import Prepared
-from rts.sampling.scene import Scene
+from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
@@ -392,14 +392,16 @@ class ImageResiduals(Residuals):
 
         scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
         self._refuse_other(scene.channels)
-        sampled = sampled_scene(scene, scene.camera, size, self._settings)
+        settings = self._settings.of(scene)
+        sampled = sampled_scene(scene, settings.grid(scene, scene.camera, size), settings)
         return _Band(top, rows, window, sampled, scene.parts)
 
     def _splats(self, band: _Band, parameters: Tree) -> Splats:
         """The splats of a band's samples at other values of the parameters."""
         parts, camera = _checked(*self.scene(parameters))
         context = context_of(parts, camera, band.sampled, parameters)
-        return to_splats(band.sampled, parts, camera.for_size(self.size), band.window(camera), context)
+        grid = Grid.of_samples(band.sampled, parts, band.window(camera), context)
+        return to_splats(band.sampled, parts, camera.for_size(self.size), grid, context)
 
     def _of_samples(self, bands: Sequence[_Band], parameters: Tree) -> Array:
         """The residuals, as of `__call__`, from samples of all bands."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,8 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: shapes of ids and weights do not fit; or, on the host, an id is no index of a row.
     """
-    ids_shape, weights_shape = shape_of(ids), shape_of(weights)
+    ids_shape: Any = getattr(ids, "shape", ())
+    weights_shape: Any = getattr(weights, "shape", ())
     plain = len(ids_shape) == len(weights_shape) == 2
     if not plain or not 0 <= column <= ids_shape[1] - 3 or weights_shape[1] < 2 or ids_shape[0] != weights_shape[0]:
         raise InputError(

@@ -20,7 +20,7 @@ def matmul(a: Array, b: Array) -> Array:
         return a @ b
     engine = engine_of(a, b)
     if type(a) is not type(b):
-        a, b = constants(a, engine, b), constants(b, engine, a)
+        a, b = (engine.constant(a, b), b) if type(a) is np.ndarray else (a, constants(b, engine, a))
     return engine.product(a, b)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays.engines import engine_of
+from rts.arrays.engines import OWNERS, engine_of
 from rts.arrays.trees import Array
 from rts.operations.take import take
 
@@ -15,7 +15,7 @@ def with_room(rows: Array) -> Array:
     What is computed from the result has few shapes, however many lengths `rows` has from call to call. So an engine
     that compiles eager operations for each shape, as jax does, neither compiles nor keeps more programs.
     """
-    engine, count = engine_of(rows), rows.shape[0]
+    engine, count = OWNERS.get(type(rows)) or engine_of(rows), rows.shape[0]
     size = engine.room(count, rows)
     if size == count or not count:
         return rows

@@ -9,7 +9,7 @@ import numpy as np
 from rts.arrays.array_functions import dot
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.operations.operation import Operation
+from rts.operations.operation import Operation, known_value
 
 
 def unit(x: Array) -> Array:
@@ -32,8 +32,7 @@ def _specification(x: Array) -> Array:
 
 def _is_moderate(square: Array) -> bool:
     """True if squares are known, on the host, and far from the ends of float32; zeros are not, and may be underflow."""
-    engine = engine_of(square)
-    values = engine.known(square) if engine.on_host(square) else None
+    values = known_value(square)
     return values is not None and bool(values.min(initial=1.0) > 1e-24 and values.max(initial=1.0) < 1e24)
 
 

@@ -20,7 +20,7 @@ from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared, warn_of_moved_vertices
-from rts.sampling.scene import Scene
+from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
@@ -114,7 +114,7 @@ def render(
 
 def image_over(scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene over a checked background; see `render`."""
-    context = scene.context if is_constant(background) else scene.context_with(background)
+    context = scene.context if background is None else scene.context_with(background)
     return over_background(warned_if_empty(image_of(scene, size, context, settings), scene), background)
 
 
@@ -127,8 +127,8 @@ def outputs_over(
     splatter = settings.splatter
     assert splatter is not None
 
-    def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
-        splats = to_splats(sampled, widened.parts, widened.camera, window, context)
+    def drawn(sampled: Sampled, grid: Grid) -> tuple[Array, ...]:
+        splats = to_splats(sampled, widened.parts, widened.camera, grid, context)
         return cropped_image(splatter, splats), *fronts_of(outputs.fronts, sampled, splats)
 
     image, *fronts = _by_bands(widened, size, context, settings, drawn)
@@ -144,8 +144,8 @@ def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: Re
     splatter = settings.splatter
     assert splatter is not None
 
-    def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
-        return (splatted(sampled, scene, window, context, splatter),)
+    def drawn(sampled: Sampled, grid: Grid) -> tuple[Array, ...]:
+        return (splatted(sampled, scene, grid, context, splatter),)
 
     return _by_bands(scene, size, context, settings, drawn)[0]
 
@@ -155,23 +155,25 @@ def _by_bands(
     size: tuple[int, int],
     context: Context,
     settings: RenderSettings,
-    draw: Callable[[Sampled, Camera], tuple[Array, ...]],
+    draw: Callable[[Sampled, Grid], tuple[Array, ...]],
 ) -> tuple[Array, ...]:
     """The arrays (H, W, ·) that `draw` makes of the samples of the image, drawn whole, or in bands that are joined."""
     bands = settings.bands(size)
     if len(bands) == 1:
-        return draw(_sampled(scene, scene.camera, size, settings), scene.camera)
+        grid = settings.grid(scene, scene.camera, size)
+        return draw(_sampled(scene, grid, settings), grid)
     drawn = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(_sampled, scene, window, (rows, size[1]), settings)
-        drawn.append(context.engine.checkpoint(take, lambda s, w=window: draw(s, w)))
+        grid = settings.grid(scene, window, (rows, size[1]))
+        take = partial(_sampled, scene, grid, settings)
+        drawn.append(context.engine.checkpoint(take, lambda s, g=grid: draw(s, g)))
     return tuple(namespace(*arrays).concat(arrays) for arrays in zip(*drawn, strict=True))
 
 
-def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
-    """The samples of a window of the image, with a warning if front samples exceed the capacity."""
-    sampled = sampled_scene(scene, window, size, settings)
+def _sampled(scene: Scene, grid: Grid, settings: RenderSettings) -> Sampled:
+    """The samples of cells of the image, with a warning if front samples exceed the capacity."""
+    sampled = sampled_scene(scene, grid, settings)
     if settings.capacity is not None:
         left_out, row = value_of(sampled.overflow), value_of(sampled.row)
         # The deepest layers are left out first.
@@ -237,7 +239,8 @@ def render_samples(
         sampled = _narrowed(replace(sampled, stencil=None), apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
     context = scene.context_with(sampled, background)
-    return over_background(splatted(sampled, scene, scene.camera, context, splatter), background)
+    grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
+    return over_background(splatted(sampled, scene, grid, context, splatter), background)
 
 
 def _narrowed(sampled: Sampled, count: int) -> Sampled:
@@ -248,28 +251,28 @@ def _narrowed(sampled: Sampled, count: int) -> Sampled:
     return replace(sampled, cells=sampled.cells.map(lambda x: x[..., rows, columns]), apron=sampled.apron - count)
 
 
-def splatted(sampled: Sampled, scene: Scene, window: Camera, context: Context, splatter: Splatter) -> Array:
-    """The image (H, W, C + 1) of a window, a rectangle of the camera's image, from the samples in it.
+def splatted(sampled: Sampled, scene: Scene, grid: Grid, context: Context, splatter: Splatter) -> Array:
+    """The image (H, W, C + 1) of cells, those of the camera's image or a window of it, from the samples in them.
 
     Args:
         sampled: the samples.
         scene: the checked scene; shaders see its camera, that of the whole image.
-        window: the camera of the window.
+        grid: the cells.
         context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
     """
-    return cropped_image(splatter, to_splats(sampled, scene.parts, scene.camera, window, context))
+    return cropped_image(splatter, to_splats(sampled, scene.parts, scene.camera, grid, context))
 
 
 def warned_if_empty(image: Array, scene: Scene, name: str = "the image") -> Array:
     """The image (H, W, C + 1) itself; a warning names it if alpha is 0 everywhere. A traced image is not looked at."""
     engine, (height, width) = engine_of(image), image.shape[:2]
-    if not engine.on_host(image):
+    pixels = engine.at_hand(image)
+    if pixels is None:
         visible = value_of(engine.namespace.any(image[..., -1] > 0))
         if visible is None or visible.any():
             return image
-    pixels = engine.known(image)
-    if pixels is None or pixels[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or pixels[..., -1].any():
+    elif pixels[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or pixels[..., -1].any():
         return image
     warn(f"nothing is seen in {name}: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image

@@ -39,7 +39,7 @@ class OneTransform:
 
         If they are not `moving`, without the derivative in the transform.
         """
-        rows = _linear(self.cofactors[0])
+        rows = self.cofactors[0]
         return affine_map(rows if moving else stopped(rows), normals)
 
     def tangents(self, tangents: Array) -> Array:
@@ -74,17 +74,14 @@ class ViewTransforms:
 
     def normals(self, normals: Array, moving: bool = True) -> Array:
         """Normals (N, 3), moved."""
-        matrices = _cofactors(self.matrices)[0]
-        return self._turned(matrices if moving else stopped(matrices), normals)
+        rows = _cofactors(self.matrices)[0]
+        return affine_map_of_views(rows if moving else stopped(rows), normals, self.view)
 
     def tangents(self, tangents: Array) -> Array:
         """Tangents with signs (N, 4), moved."""
-        moved, sign = self._turned(self.matrices[:, :3, :3], tangents[:, :3]), _cofactors(self.matrices)[1][..., 0]
+        moved = affine_map_of_views(_linear(self.matrices[:, :3, :3]), tangents[:, :3], self.view)
+        sign = _cofactors(self.matrices)[1][..., 0]
         return namespace(moved).concat([moved, tangents[:, 3:] * take(sign, index_of_views(self.view))], axis=1)
-
-    def _turned(self, matrices: Array, vectors: Array) -> Array:
-        """Vectors (N, 3) times the matrices (B, 3, 3)."""
-        return affine_map_of_views(_linear(matrices), vectors, self.view)
 
 
 def _linear(matrix: Array) -> Array:
@@ -94,7 +91,7 @@ def _linear(matrix: Array) -> Array:
 
 
 def _cofactors(matrix: Array) -> tuple[Array, Array]:
-    """The cofactor matrix (..., 3, 3) of the linear part of affine maps (..., 4, 4), times the sign of its determinant.
+    """The cofactors of the linear part of affine maps (..., 4, 4), times the sign of its determinant: rows (..., 3, 4).
 
     Also this sign (..., 1, 1): 1, or −1 for a mirror.
     """
@@ -104,4 +101,4 @@ def _cofactors(matrix: Array) -> tuple[Array, Array]:
     cofactors = xp.linalg.cross(*following)
     volume = xp.sum(rows[..., :1, :] * cofactors[..., :1, :], axis=-1, keepdims=True)
     sign = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
-    return cofactors * sign, sign
+    return _linear(cofactors * sign), sign

@@ -62,29 +62,23 @@ def sample(
         size, "auto" if splatter is None else splatter, layers, supersample, capacity
     )
     scene, settings = scene.at(size), replace(settings, splatter=None) if splatter is None else settings
-    return sampled_scene(scene, scene.camera, size, settings, one_shader=False)
+    settings = settings.of(scene)
+    return sampled_scene(scene, settings.grid(scene, scene.camera, size), settings, one_shader=False)
 
 
 def sampled_scene(
-    scene: Scene,
-    camera: Camera,
-    size: tuple[int, int],
-    settings: RenderSettings,
-    one_shader: bool = True,
-    stays: bool = False,
+    scene: Scene, grid: Grid, settings: RenderSettings, one_shader: bool = True, stays: bool = False
 ) -> Sampled:
-    """The samples of a window of the image, through the camera of this window; see `sample`.
+    """The samples of the cells of an image, or of a window of it; see `sample`, `RenderSettings.grid` and its `of`.
 
     With `one_shader` they serve the shaders of the scene and derivatives in its values alone, so that cells of one
     colour may name one sample, and samples beside outlines need not tell motions of what is constant. With `stays`,
     samples that were found on the host are not moved into the scene's engine; see `in_engine`.
     """
-    settings = settings.of(scene)
     factor, capacity = settings.supersample, settings.capacity
-    height, width = factor * size[0], factor * size[1]
-    check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     apron, outlines = settings.apron, settings.finds_outlines
-    grid = Grid.sampled(scene, camera, (height, width), apron)
+    height, width = grid.size[0] - 2 * apron, grid.size[1] - 2 * apron
+    check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     given, (scene, grid) = scene, on_the_host(scene, grid)
     told = settings.told([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.

@@ -5,16 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from rts.compiling.threads import thread_count
-from rts.contracts.checks import check_size, check_splatter, is_auto
+from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
 from rts.outlines.found import Told
 from rts.plugin_base import promised
 from rts.sampling.layer_count import TRACED_LAYERS
-from rts.sampling.scene import Scene
+from rts.sampling.scene import Grid, Scene
+from rts.scene.camera import Camera
 
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
@@ -65,7 +66,7 @@ class RenderSettings:
         """
         thread_count()  # Refused here, before anything is sampled.
         size = check_size(size, layers, capacity, supersample)
-        layers = layers if is_auto(layers) else int(layers)
+        layers = layers if layers == "auto" else int(layers)
         return size, cls(check_splatter(splatter), layers, int(supersample), capacity)
 
     def of(self, scene: Scene) -> RenderSettings:
@@ -77,7 +78,8 @@ class RenderSettings:
             layers = TRACED_LAYERS[opaque]
         if most is not None:
             layers = most if layers == "auto" else min(most, int(layers))
-        return self if layers == self.layers else replace(self, layers=layers)
+        given = self.supersample, self.capacity, self.fronts
+        return self if layers == self.layers else RenderSettings(splatter, layers, *given)
 
     @property
     def finds_outlines(self) -> bool:
@@ -102,7 +104,12 @@ class RenderSettings:
         """
         if self.splatter is None:
             return APRON
-        return self.splatter.reach + 1 + (OUTLINES_APRON if self.finds_outlines else 0)
+        return self.splatter.reach + 1 + (OUTLINES_APRON if "outlines" in self.splatter.reads else 0)
+
+    def grid(self, scene: Scene, camera: Camera, size: tuple[int, int]) -> Grid:
+        """The cells of an image (height, width) of a scene, or of a window of it, through its camera."""
+        cells = self.supersample * size[0], self.supersample * size[1]
+        return Grid.of_parts(scene.parts, camera, cells, self.apron, scene.context)
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
         """(first row, number of rows) of each band of an image (height, width).

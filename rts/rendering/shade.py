@@ -45,8 +45,9 @@ def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer
         if samples.gbuffer_names is None or (wanted is not None and set(wanted) <= set(samples.gbuffer_names)):
             return _checked(GBuffer(samples.gbuffer), part, samples)
     gbuffer = part.surface.evaluate(context.constants(theta), samples)
-    if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
-        what = f"one with {sorted(gbuffer)}" if isinstance(gbuffer, Mapping) else kind_of(gbuffer)
+    known = type(gbuffer) is GBuffer or isinstance(gbuffer, Mapping)
+    if not known or "position" not in gbuffer:
+        what = f"one with {sorted(gbuffer)}" if known else kind_of(gbuffer)
         raise InputError(f"evaluate of {part.surface!r} gave {what}; expected an rts.GBuffer with 'position'")
     return _checked(gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer), part, samples)
 
@@ -106,18 +107,25 @@ def shade(
         camera: the camera of the whole image, or of each sample.
         engine: the engine to compute with.
     """
-    world = _to_world(_readable(local, samples, engine), transform)
+    padded = engine.padded(samples.row)
+    # Unused rows hold values with finite derivatives for the shader, too.
+    changes = dict.fromkeys(local, lambda x: engine.fill_unused(x, samples.row)) if padded else {}
+    world = _to_world(local.changed(changes) if padded else local, transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform:  # One colour, however many rows are in use.
+    if part.uniform or not padded:  # One colour, however many rows are in use; or all are.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):
         rows[NUMBER] = camera.number
 
     def few(rows: dict[str, Array]) -> Array:
+        """The colours of some rows of the attributes that the shader has read in its first call, in local space."""
         row_cameras = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
-        return _colors(part, theta, transform, row_cameras, names, rows)
+        few_local = GBuffer(rows)
+        for name in set(names) - set(rows):
+            few_local.defer(name, _unread)
+        return _shaded(part, theta, _to_world(few_local, transform), row_cameras)
 
     with suppress(_UnreadError):
         rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
@@ -167,43 +175,8 @@ class _UnreadError(Exception):
     """A shader reads an attribute that it did not read in its first call."""
 
 
-def _colors(
-    part: CheckedPart,
-    theta: Mapping[str, Tree],
-    transform: Array | ViewTransforms | None,
-    camera: Camera | RowCameras,
-    names: Sequence[str],
-    attributes: Mapping[str, Array],
-) -> Array:
-    """The colours (n, C + 1) that a part's shader gives for n rows of the attributes that it has read.
-
-    Args:
-        part: the part.
-        theta: the result of `theta_of`.
-        transform: the part's transform, or None.
-        camera: the camera of the whole image, or of each row.
-        names: all attributes that the part has.
-        attributes: those that the shader read in its first call, (n, ·) each, local space.
-
-    Raises:
-        _UnreadError: the shader reads another one of `names` now.
-    """
-
-    def unread() -> Array:
-        raise _UnreadError
-
-    local = GBuffer(attributes)
-    for name in names:
-        if name not in local:
-            local.defer(name, unread)
-    return _shaded(part, theta, _to_world(local, transform), camera)
-
-
-def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
-    """The G-buffer for shaders: unused rows hold values with finite derivatives, too."""
-    if not engine.padded(samples.row):
-        return gbuffer
-    return gbuffer.changed(dict.fromkeys(gbuffer, lambda x: engine.fill_unused(x, samples.row)))
+def _unread() -> Array:
+    raise _UnreadError
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:

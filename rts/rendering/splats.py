@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -18,30 +19,44 @@ from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
 from rts.sampling.scene import Grid
 from rts.scene.camera import Camera
 
+_OPAQUE = attrgetter("shader.opaque")
 
-def to_splats(
-    sampled: Sampled,
-    parts: Sequence[CheckedPart],
-    camera: Camera,
-    window: Camera,
-    context: Context,
-) -> Splats:
+
+def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, grid: Grid, context: Context) -> Splats:
     """Evaluate, shade and project samples into splats, with the apron as border. Fine samples are left out.
 
     Args:
         sampled: the samples.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
-        window: the camera of the samples.
+        grid: the cells of the samples: those of the image, or a window of it, through the same view.
         context: the engine to compute with, and an exemplar of its constants and of the splats.
     """
-    height, width, apron = *sampled.row.shape[1:], sampled.apron
-    grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
-    sampled = owned(sampled, sampled.row, context)
-    positions, rgba = concatenated(
-        *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, sampled.stencil)
-    )
-    return splats_of(sampled, parts, positions, rgba, context, border=apron, supersample=sampled.supersample)
+    inputs, engine = of_inputs(context), context.engine
+    sampled, projection = owned(sampled, sampled.row, context), context.constants(camera.projection)
+    camera = camera.replace(view=context.constants(grid.camera.view), projection=projection)
+    positions, colors, first = [], [], 0
+    for index, (part, samples) in enumerate(zip(parts, sampled.samples, strict=True)):
+        theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
+        local = evaluate(part, samples, inputs)
+        local_camera = grid.cameras[index]
+        if not engine.owns(local_camera.view):  # The context's engine is that of the background, or of a shader.
+            local_camera = local_camera.replace(view=inputs.constants(local_camera.view))
+        add_footprint(part, samples, local, local_camera, grid.size, inputs)
+        padded = sampled.stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
+        used = all_in_use(samples, inputs, sampled.stencil, first) if padded else samples
+        world, rgba = shade(part, theta, transform, used, local, camera, engine)
+        position = local["position"] if samples.centered else on_rays(samples, local["position"])
+        placed = projective_map(local_camera.pixel_rows(grid.size), position)
+        positions.append(context.constants(placed))
+        check_splats(index, part, world, positions[-1], rgba, sampled.row, first)
+        colors.append(context.constants(rgba))
+        first += samples.ids.shape[-2]
+    if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
+        # A shader may close over arrays of an engine that the scene has none of.
+        positions, colors = context_of(positions, colors).constants((positions, colors))
+    placed, rgba = concatenated(positions, colors)
+    return splats_of(sampled, parts, placed, rgba, context, border=sampled.apron, supersample=sampled.supersample)
 
 
 def owned(tree: Tree, row: Array, context: Context) -> Tree:
@@ -61,51 +76,8 @@ def splats_of(
     cells, stencil = Cells(sampled.row), sampled.stencil
     if not context.engine.owns(rgba):
         cells, stencil = context_of(positions, rgba).constants((cells, stencil))
-    opaque = all([p.shader.opaque for p in parts])
+    opaque = all(map(_OPAQUE, parts))
     return Splats(positions, rgba, cells, opaque=opaque, stencil=stencil, **more)
-
-
-def _positions_and_colors(
-    sampled: Sequence[Samples],
-    row: Array,
-    parts: Sequence[CheckedPart],
-    camera: Camera,
-    grid: Grid,
-    context: Context,
-    stencil: Stencil | None = None,
-) -> tuple[list[Array], list[Array]]:
-    """Positions (N, 3) and colours (N, C + 1) of the samples of each part, all of one engine.
-
-    Args:
-        sampled: the samples of each part.
-        row: integers, the indices of the visible samples, counted over all parts; −1 for none.
-        parts: checked parts.
-        camera: the camera of the whole image, which shaders see.
-        grid: the cells of the samples, and their camera.
-        context: the engine to compute with, and an exemplar of the results.
-        stencil: names the samples beside outlines, behind those of cells; None without outlines.
-    """
-    inputs, engine = of_inputs(context), context.engine
-    world_camera = grid.camera.replace(view=inputs.constants(grid.camera.view))
-    camera = context.constants(camera)
-    positions, colors, first = [], [], 0
-    for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
-        theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
-        local = evaluate(part, samples, inputs)
-        local_camera = world_camera.within(transform)
-        add_footprint(part, samples, local, local_camera, grid.size, inputs)
-        padded = stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
-        used = all_in_use(samples, inputs, stencil, first) if padded else samples
-        world, rgba = shade(part, theta, transform, used, local, camera, engine)
-        placed = projective_map(local_camera.pixel_rows(grid.size), on_rays(samples, local["position"]))
-        positions.append(context.constants(placed))
-        check_splats(index, part, world, positions[-1], rgba, row, first)
-        colors.append(context.constants(rgba))
-        first += samples.ids.shape[-2]
-    if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
-        # A shader may close over arrays of an engine that the scene has none of.
-        positions, colors = context_of(positions, colors).constants((positions, colors))
-    return positions, colors
 
 
 def _has_own_rows(samples: Samples) -> bool:
@@ -119,7 +91,7 @@ def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, firs
     Args:
         samples: the samples of a part.
         context: of their arrays.
-        stencil: see `_positions_and_colors`; None if some row is in use.
+        stencil: names the samples beside outlines, behind those of cells; None if some row is in use.
         first: the index of the part's first sample.
     """
     xp, count = namespace(samples.row), samples.ids.shape[-2]
@@ -144,12 +116,10 @@ def all_in_use(samples: Samples, context: Context, stencil: Stencil | None, firs
 
 
 def on_rays(samples: Samples, position: Array) -> Array:
-    """Positions (N, 3) of samples, moved onto the rays of their cells unless they are centred; derivatives stay.
+    """Positions (N, 3) of samples that are not centred, moved onto the rays of their cells; derivatives stay.
 
     Splatters need samples whose motion starts at their cells' centres. On the rays, projections are finite, too.
     """
-    if samples.centered:
-        return position
     if ON_RAYS not in samples.tables:
         raise InputError(
             f"samples are not centered, and have no table {ON_RAYS!r}: expected (N, 3), where their cells' rays are at "

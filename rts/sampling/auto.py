@@ -11,6 +11,7 @@ from rts.contracts.records import Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import PluginError
+from rts.plugin_base import is_subclass
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -37,6 +38,13 @@ class Choice(NamedTuple):
     remarks: tuple[str, ...] = ()
 
 
+_MOVING = Choice(
+    "raster",
+    "its triangles may change with every call, so nothing is built for them (they count as fixed where only other "
+    "things are differentiated)",
+)
+
+
 def choose(part: Part, *, static: bool) -> Choice:
     """The sampler for a part.
 
@@ -45,11 +53,10 @@ def choose(part: Part, *, static: bool) -> Choice:
         static: True if its triangles stay the same from call to call.
     """
     surface = part.surface
-    if not isinstance(surface, TriangleSurface):
+    if not is_subclass(type(surface), TriangleSurface):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
     if not static:
-        reason = "its triangles may change with every call, so nothing is built for them"
-        return Choice("raster", f"{reason} (they count as fixed where only other things are differentiated)")
+        return _MOVING
     faces = surface.face_count
     if faces is None:
         return Choice("raster", f"{surface!r} does not say how many triangles it has (`face_count`)")
@@ -64,7 +71,7 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 def is_static(part: Part, camera: Camera) -> bool:
     """True if the engine differentiates, but the surface reads constants only: calls repeat, and triangles stay."""
-    constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
+    constant = is_constant(tuple(map(part.theta.get, part.surface.reads(part.theta))))
     return constant and engine_of(part, camera).differentiates
 
 
@@ -74,7 +81,8 @@ class Auto(Sampler):
     def sampler_for(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
         choice = choose(part, static=camera is None or is_static(part, camera))
-        _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
         return registry.instance("rts.samplers", choice.sampler)
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:

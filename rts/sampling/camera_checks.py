@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 
@@ -18,7 +19,8 @@ def on_host(camera: Camera) -> Camera:
     if type(camera.view) is type(camera.projection) is np.ndarray:
         if camera.view.dtype == camera.projection.dtype == np.float64:
             return camera
-    view, projection = host_value(camera.view), host_value(camera.projection)
+    view, projection = host_value(camera.view), camera.projection
+    projection = projection if type(projection) is np.ndarray else host_value(projection)
     return camera.replace(view=np.asarray(view, np.float64), projection=np.asarray(projection, np.float64))
 
 
@@ -39,14 +41,14 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     Returns:
         The camera, the last row of its view without rounding.
     """
-    for name, matrix in (("view", camera.view), ("projection", camera.projection)):
-        if not np.isfinite(matrix).all():
+    # Few numbers: NumPy would take far longer.
+    few = camera.view.ravel().tolist(), camera.projection.ravel().tolist()
+    for name, numbers in zip(("view", "projection"), few, strict=True):
+        if not all(map(math.isfinite, numbers)):
             bad = name == "view" and transform is not None and not np.isfinite(transform).all()
             what = "transform of a part" if bad else f"camera's {name} matrix"
             raise InputError(f"the {what} holds NaN or infinity; check how it was made")
-    if max(map(largest_absolute, (camera.view, camera.projection))) > LARGEST:
-        _refuse_large(camera, transform)
-    if largest_absolute(camera.projection @ camera.view) > LARGEST:
+    if max(map(abs, [*few[0], *few[1]])) > LARGEST or largest_absolute(camera.projection @ camera.view) > LARGEST:
         _refuse_large(camera, transform)
     # Most are far from singular; singular values take longer.
     well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
@@ -101,7 +103,7 @@ def _spread(m: np.ndarray) -> float:
 
     It is 1 for orthogonal rows, 0 for dependent rows.
     """
-    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
+    a, b, c, d, e, f, g, h, i = m.ravel().tolist()
     square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
     return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
 

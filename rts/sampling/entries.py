@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from rts.arrays.array_functions import shape_of
-from rts.arrays.engines import OWNERS, host_value, is_constant, stopped, value_of
+from rts.arrays.engines import CONSTANT_TYPES, engine_of, host_value, is_constant, stopped
 from rts.arrays.trees import Array, Tree, collected, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
+from rts.plugin_base import is_subclass
 from rts.sampling.cache import Entry
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -19,12 +17,8 @@ from rts.scene.camera import Camera
 
 def is_known(scene: Scene, grid: Grid) -> bool:
     """False if samples depend on traced values, or on several values at once."""
-    for x in collected((scene.read, [part.transform for part in scene.parts], grid.camera)):
-        if type(x) is not np.ndarray:
-            shape, value = _probed(x)
-            if value is None or value.ndim != len(shape):
-                return False
-    return True
+    arrays = collected((scene.read, [part.transform for part in scene.parts], grid.camera))
+    return scene.context.engine.are_known([x for x in arrays if not isinstance(x, CONSTANT_TYPES)])
 
 
 def is_still(scene: Scene) -> bool:
@@ -41,18 +35,7 @@ def is_still(scene: Scene) -> bool:
 
 def is_batched(x: Array) -> bool:
     """True for an array, or a number, of which a transform maps over several values."""
-    shape, value = _probed(x)
-    return value is not None and value.ndim != len(shape)
-
-
-def _probed(x: Array) -> tuple[tuple[int, ...], np.ndarray | None]:
-    """The shape and the value of an array; on another device, of an empty part of it, so that nothing crosses."""
-    engine = OWNERS.get(type(x))
-    if engine is None:
-        return shape_of(x), value_of(x)
-    if len(x.shape) and not engine.on_host(x):
-        x = x[:0, ...]
-    return x.shape, engine.known(x)
+    return not (isinstance(x, CONSTANT_TYPES) or engine_of(x).traced(x) or engine_of(x).are_known([x]))
 
 
 def inputs_of(scene: Scene) -> list[Tree]:
@@ -63,11 +46,11 @@ def inputs_of(scene: Scene) -> list[Tree]:
 
 def proxy_inputs(part: CheckedPart) -> Tree:
     """The inputs of a part's proxy, without derivatives; None if it has no triangles."""
-    surface = part.surface
-    return stopped(surface.proxy_inputs(stopped(part.theta))) if isinstance(surface, TriangleSurface) else None
+    surface: Any = part.surface
+    return stopped(surface.proxy_inputs(stopped(part.theta))) if is_subclass(type(surface), TriangleSurface) else None
 
 
 def entry_of(part: CheckedPart, sampler: TriangleSampler, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
     """The part's prepared entry, with the inputs of its proxy, on the host."""
     surface: Any = part.surface
-    return sampler.working_on(surface, inputs, camera, size, None, lambda known: known._replace(inputs=inputs))
+    return sampler.working_on(surface, inputs, camera, size, None, lambda known: Entry(*known[:2], inputs))

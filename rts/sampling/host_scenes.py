@@ -7,20 +7,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import repeat
+from operator import is_not
+from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import Context, engine_of, floating_bits, host_value, is_constant, namespace
-from rts.arrays.trees import Tree, collected, map_leaves
+from rts.arrays.engines import Context, engine_of, floating_bits, host_value, is_constant
+from rts.arrays.trees import Tree, collected, join_record, map_leaves
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.records import ArraySpec, Sampled, Samples
-from rts.contracts.sampler import Sampler
-from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import overrides
+from rts.contracts.records import Sampled, Samples
 from rts.sampling.camera_checks import check_camera, on_host
 from rts.sampling.entries import entry_of, is_known, proxy_inputs
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.triangle_sampler import is_drawn
 
 
 def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
@@ -29,7 +29,10 @@ def on_the_host(scene: Scene, grid: Grid) -> tuple[Scene, Grid]:
     Only entries are added for engines that pad; nothing where values are traced, or several at once, or where a sampler
     has a way of its own.
     """
-    if scene.cameras or not all(map(_is_drawn, scene.parts, scene.samplers)) or not is_known(scene, grid):
+    for part, sampler in zip(scene.parts, scene.samplers, strict=True):
+        if not is_drawn(type(part.surface), type(sampler)):
+            return scene, grid
+    if scene.cameras or not is_known(scene, grid):
         return scene, grid
     here, cells = from_values(scene, grid.size, values_of(scene, grid))
     like = scene.context.like
@@ -54,25 +57,17 @@ def from_values(scene: Scene, size: tuple[int, int], values: Tree) -> tuple[Scen
     An InputError if a camera makes no image.
     """
     entries, cameras, (camera, of_parts) = [], [], values
+    sampler: Any
     for part, sampler, entry, given in zip(scene.parts, scene.samplers, scene.entries, of_parts, strict=True):
         seen, transform, inputs = given
         seen = check_camera(on_host(seen), None if transform is None else host_value(transform))
         if entry is None:
-            assert isinstance(sampler, TriangleSampler)
             entry = entry_of(part, sampler, map_leaves(host_value, inputs), seen, size)
         entries.append(entry)
         cameras.append(seen)
-    parts = [replace(part, theta={}, transform=None) for part in scene.parts]
+    parts = [join_record(CheckedPart, ({}, None), (part.surface, part.shader, part.cull)) for part in scene.parts]
     context = Context(engine_of(), np.zeros((), real_of(scene)))
-    here = scene._replace(parts=parts, entries=entries, cameras=cameras, context=context)
-    return here, Grid(on_host(camera), size)
-
-
-def _is_drawn(part: CheckedPart, sampler: Sampler) -> bool:
-    """True if a part's triangles are all that its sampler asks of it, and stay as they are made."""
-    if not (isinstance(sampler, TriangleSampler) and isinstance(part.surface, TriangleSurface)):
-        return False
-    return not overrides(sampler, "sample", TriangleSampler) and not overrides(sampler, "update", TriangleSampler)
+    return Scene(parts, scene.camera, scene.samplers, entries, context, cameras), Grid(on_host(camera), size)
 
 
 def real_of(scene: Scene) -> type:
@@ -89,15 +84,12 @@ def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
     engine, like = scene.context
     if not engine.differentiates:
         return sampled
-    samples = [_evaluated(*one, real_of(scene)) for one in zip(scene.parts, sampled.samples, strict=True)]
-    sampled = replace(sampled, samples=tuple(samples))
+    samples = tuple(map(_evaluated, scene.parts, sampled.samples, repeat(real_of(scene))))
+    if any(map(is_not, samples, sampled.samples)):
+        sampled = replace(sampled, samples=samples)
     leaves = collected(sampled)
     arrays = dict(zip(map(id, leaves), leaves, strict=True))  # Some stand in it twice, as the cells of a single part.
-    specs = [ArraySpec(x.shape, x.dtype) for x in arrays.values()]
-    # None of its numbers cross: it only says where to.
-    place = [] if like is None else [namespace(like).reshape(like, (-1,))[:0]]
-    results = engine.call_host(lambda *_: list(arrays.values()), specs, *place)
-    moved = dict(zip(arrays, results, strict=True))
+    moved = dict(zip(arrays, engine.placed(list(arrays.values()), like), strict=True))
     return map_leaves(partial(next, map(moved.__getitem__, map(id, leaves))), sampled)
 
 

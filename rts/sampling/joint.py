@@ -17,11 +17,9 @@ import numpy as np
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Proxy, Sampled, Samples
-from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import overrides
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
-from rts.sampling.triangle_sampler import TriangleSampler, rasterized
+from rts.sampling.triangle_sampler import TriangleSampler, is_drawn, rasterized
 from rts.scene.camera import Camera
 
 MOST = 2**15
@@ -193,13 +191,11 @@ def _wide(tables: Sequence[np.ndarray]) -> np.ndarray:
     )
 
 
-def is_suited(part: CheckedPart, sampler: object) -> bool:
+def is_suited(part: CheckedPart, sampler: Any) -> bool:
     """True if a part can be sampled along with others."""
-    surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
-        return False
-    own = overrides(sampler, "sample", TriangleSampler) or overrides(sampler, "update", TriangleSampler)
-    return not own and surface.centered and not surface.refines and not surface.depends_on_view
+    surface: Any = part.surface
+    drawn = is_drawn(type(surface), type(sampler))
+    return drawn and surface.centered and not surface.refines and not surface.depends_on_view
 
 
 def joins(sampler: object) -> bool:

@@ -22,23 +22,28 @@ from rts.splatting.cells import check_rows
 
 
 def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
-    """The proxy of a surface for host inputs, refused where it cannot be drawn."""
-    proxy = _packed_proxy(surface.proxy(inputs, camera, size), surface)
-    check_proxy(proxy, surface)
-    return proxy
+    """The proxy of a surface for host inputs, in contiguous arrays of the right dtypes; refused if it cannot be drawn.
 
-
-def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
-    """The proxy with contiguous arrays of the right dtypes; wrong shapes, widths and indices are refused."""
+    Shapes, widths and indices must fit, and vertices be neither NaN nor infinite, nor larger than `LARGEST`.
+    """
+    proxy: Any = surface.proxy(inputs, camera, size)
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
-    if getattr(proxy.vertices, "dtype", None) == np.float64:
-        _check_size(largest_absolute(proxy.vertices), surface)  # In float32 they may be infinite.
-    faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
-    origin = _origin(proxy.vertices, faces)
-    near = proxy.vertices if origin is None else proxy.vertices - origin
+    faces, near, origin = _table(surface, "faces", proxy.faces, (3,), np.int32), proxy.vertices, None
+    if getattr(near, "dtype", None) == np.float64:
+        _check_size(largest_absolute(near), surface)  # In float32 they may be infinite.
+        origin = _origin(near, faces)
+        near = near if origin is None else near - origin
     vertices = _table(surface, "vertices", near, (3,), np.float32)
-    check_faces(Proxy(vertices, faces), surface)
+    if not np.isfinite(most := largest_absolute(vertices)):
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        raise InputError(
+            f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
+            f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
+        )
+    if most > LARGEST:
+        _check_size(most, surface)
+    check_faces(vertices, faces, surface)
     none = proxy.ids is None and not surface.refines and surface.sample_widths[0] == 0
     ids = np.zeros((len(faces), 0), np.int32) if none else proxy.ids
     ids = ids if ids is None or ids is faces else _table(surface, "ids", ids, (-1,), np.int32)
@@ -78,7 +83,7 @@ def _origin(vertices: Any, faces: np.ndarray) -> np.ndarray | None:
     Vertices that no face has do not count. Its coordinates are multiples of a power of two no smaller than the box of
     the vertices, so that most meshes in one place get one origin, and vertices that coincide are rounded alike.
     """
-    if getattr(vertices, "dtype", None) != np.float64 or vertices.shape[1:] != (3,) or not len(faces):
+    if vertices.shape[1:] != (3,) or not len(faces):
         return None
     some = faces[:: -(-len(faces) // LOOKED_AT), 0]
     if not 0 <= some.min() <= some.max() < len(vertices):
@@ -98,14 +103,14 @@ def _origin(vertices: Any, faces: np.ndarray) -> np.ndarray | None:
     return np.round((low / 2 + high / 2) / step) * step
 
 
-def check_faces(proxy: Proxy, surface: Any = None) -> None:
+def check_faces(vertices: np.ndarray, faces: np.ndarray, surface: Any = None) -> None:
     """Refuse faces with an index that is no vertex's, before compiled code reads there."""
-    if not len(proxy.faces):
+    if not len(faces):
         return
-    least, most = table_extent(proxy.faces)
-    if not 0 <= least <= most < len(proxy.vertices):
+    least, most = table_extent(faces)
+    if not 0 <= least <= most < len(vertices):
         name = "the proxy" if surface is None else f"the proxy of {surface!r}"
-        raise InputError(f"{name} has faces from {least} to {most}, but {len(proxy.vertices)} vertices")
+        raise InputError(f"{name} has faces from {least} to {most}, but {len(vertices)} vertices")
 
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
@@ -184,18 +189,6 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
     if last >= faces:
         raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
     return covered
-
-
-def check_proxy(proxy: Proxy, surface: Any) -> None:
-    """Refuse vertices that are NaN or infinite, or larger than `LARGEST`."""
-    vertices = proxy.vertices
-    if not np.isfinite(most := largest_absolute(vertices)):
-        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-        raise InputError(
-            f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
-            f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
-        )
-    _check_size(most, surface)
 
 
 LARGEST = 1e15

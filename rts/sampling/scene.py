@@ -14,8 +14,10 @@ from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.checks import check_ratio, check_sampler, sampler_for_part
+from rts.contracts.records import Sampled
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
+from rts.plugin_base import is_subclass
 from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -86,11 +88,12 @@ class Scene(NamedTuple):
         check_ratio(self.camera, size)
         camera = self.camera.for_size(size)
         warn_of_coarse_coordinates(self.parts, camera, size, self.context)
-        return self._replace(camera=camera)
+        return Scene(self.parts, camera, *self[2:])
 
     def local_camera(self, part: int, grid: Grid) -> Camera:
         """The camera of a grid in the local space of a part."""
-        return self.cameras[part] if self.cameras else grid.camera.within(self.parts[part].transform)
+        cameras = self.cameras or grid.cameras
+        return cameras[part] if cameras else grid.camera.within(self.parts[part].transform)
 
     def context_with(self, *others: Tree) -> Context:
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""
@@ -100,28 +103,36 @@ class Scene(NamedTuple):
 
 def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:
     """True if all samples of a part lie on triangles, which tell where its outlines are."""
-    surface = part.surface
-    if not (isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface)):
+    surface: Any = part.surface
+    if not (is_subclass(type(sampler), TriangleSampler) and is_subclass(type(surface), TriangleSurface)):
         return False
     return not (surface.refines and surface.refine_moves)
 
 
 class Grid(NamedTuple):
-    """A grid of cells: its camera and its size (height, width)."""
+    """A grid of cells: its camera and its size (height, width), and the camera in each part's local space, if known."""
 
     camera: Camera
     size: tuple[int, int]
+    cameras: Sequence[Camera] = ()
 
     @classmethod
-    def around(cls, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """The grid of an image of cells (height, width) with an apron."""
-        whole = size[0] + 2 * apron, size[1] + 2 * apron
-        return cls(camera.window(size, (-apron, -apron), whole), whole)
+    def of_samples(cls, sampled: Sampled, parts: Sequence[Part], camera: Camera, context: Context) -> Grid:
+        """The grid of samples of parts that are seen by a camera; see `of_parts`."""
+        height, width = (n - 2 * sampled.apron for n in sampled.row.shape[1:])
+        return cls.of_parts(parts, camera, (height, width), sampled.apron, context)
 
     @classmethod
-    def sampled(cls, scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """The grid `around` an image, for sampling a scene: the view is an array of the scene's engine."""
+    def of_parts(
+        cls, parts: Sequence[Part], camera: Camera, size: tuple[int, int], apron: int, context: Context
+    ) -> Grid:
+        """The grid of an image (height, width) of cells with an apron, in which there are parts.
+
+        The views of cameras are arrays of the context's engine, if it differentiates.
+        """
         # One engine samples every part, through the same matrices that later project the samples.
-        if scene.context.engine.differentiates:
-            camera = camera.replace(view=scene.context.constants(camera.view))
-        return cls.around(camera, size, apron)
+        if context.engine.differentiates:
+            camera = camera.replace(view=context.constants(camera.view))
+        cells = size[0] + 2 * apron, size[1] + 2 * apron
+        camera = camera.window(size, (-apron, -apron), cells)
+        return cls(camera, cells, [camera.within(part.transform) for part in parts])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import functools
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
@@ -16,7 +17,7 @@ from rts.contracts.records import ArraySpec, Fragments, Proxy, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, PluginError
-from rts.plugin_base import overrides
+from rts.plugin_base import is_subclass, overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.sample_checks import check_faces, checked_proxy
@@ -67,7 +68,7 @@ class TriangleSampler(Sampler):
         Results are independent of one another: those of all parts may be built before one of them is drawn.
         The default returns the proxy, once its `faces` are found to name vertices; else it raises an InputError.
         """
-        check_faces(proxy)
+        check_faces(proxy.vertices, proxy.faces)
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:
@@ -151,7 +152,7 @@ class TriangleSampler(Sampler):
         """The surface's entry; kept from call to call unless its proxy is cheap and `prepare` the default."""
         if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
-            return Entry(proxy, self.prepare(proxy))
+            return Entry(proxy, proxy)
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
@@ -238,6 +239,13 @@ def rasterized(
     """`TriangleSampler.rasterize`, which one thread calls at a time unless it is `concurrent`."""
     with contextlib.nullcontext() if sampler.concurrent else sampler._keeper.lock:
         return sampler.rasterize(prepared, camera, size, layers, cull)
+
+
+@functools.lru_cache(maxsize=4096)
+def is_drawn(surface: type, sampler: type) -> bool:
+    """True if the triangles of surfaces are all that samplers ask of them, and stay as they are made; for classes."""
+    own = overrides(sampler, "sample", TriangleSampler) or overrides(sampler, "update", TriangleSampler)
+    return is_subclass(sampler, TriangleSampler) and is_subclass(surface, TriangleSurface) and not own
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:

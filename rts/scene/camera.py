@@ -254,14 +254,16 @@ class Camera(CameraConverters):
 
     def for_size(self, size: tuple[int, int]) -> Camera:
         """The camera for images of a size (height, width): itself, or a copy of that ratio if `aspect` is "open"."""
-        if self.aspect is None or type(self.aspect) is float or isinstance(self.aspect, Real):
+        aspect, projection = self.aspect, self.projection
+        if aspect is None or type(aspect) is float or (type(aspect) is not str and isinstance(aspect, Real)):
             return self
-        if not (isinstance(self.aspect, str) and self.aspect == "open"):
-            raise InputError(f"aspect is {quoted(self.aspect)}; expected width over height, 'open' or None")
+        if not (isinstance(aspect, str) and aspect == "open"):
+            raise InputError(f"aspect is {quoted(aspect)}; expected width over height, 'open' or None")
         height, width = check_pixels(size)
-        aspect = width / height
-        columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)
-        return self.replace(projection=self.projection * columns, aspect=aspect)
+        aspect, known = width / height, type(projection) is np.ndarray
+        columns = np.array([1 / aspect, 1, 1, 1], projection.dtype if known else None)
+        columns = columns if known else engine_of(projection).constant(columns, projection)
+        return self.replace(projection=projection * columns, aspect=aspect)
 
     def map(self, f: Callable[[Array], Array]) -> Camera:
         """A copy with `f` applied to both matrices."""
@@ -273,7 +275,9 @@ class Camera(CameraConverters):
             return self
         if getattr(transform, "shape", ()) != (4, 4):
             check_numbers("transform", transform, (4, 4))
-        _, (view, transform) = promote(self.view, transform)
+        view = self.view
+        if type(view) is not type(transform) or type(view) is np.ndarray:
+            _, (view, transform) = promote(view, transform)
         return self.replace(view=matmul(view, transform))
 
     def with_apron(self, size: tuple[int, int], apron: int) -> Camera:

@@ -33,7 +33,7 @@ class Part:
     def __post_init__(self):
         if not isinstance(self.cull, str) or self.cull not in ("none", "back"):
             raise InputError(f'cull is {quoted(self.cull)}; expected "none" or "back"')
-        if not isinstance(self.theta, Mapping):
+        if type(self.theta) is not dict and not isinstance(self.theta, Mapping):
             raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
         if isinstance(self.shader, str):
             registry.check_name("rts.shaders", self.shader)

@@ -31,7 +31,7 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     Raises:
         InputError: `pose` or `center` has another shape, or is not finite.
     """
-    if shape_of(pose) != (6,):
+    if getattr(pose, "shape", None) != (6,):
         if shape_of(pose)[1:] == (6,):
             several = f"pose has shape {shape_of(pose)}; expected (6,), one pose"
             raise InputError(f"{several}: stack the results of rts.rigid, or take torch.vmap or jax.vmap of it")
@@ -43,10 +43,11 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     elif shape_of(center) != (3,):
         check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
-    if not is_finite(pose, center):
+    matrix = RIGID(pose, center)
+    if not is_finite(matrix) and not is_finite(pose, center):
         name = "center" if is_finite(pose) else "pose"
         raise InputError(f"{name} of rts.rigid holds NaN or infinity; expected finite numbers")
-    return RIGID(pose, center)
+    return matrix
 
 
 def _specification(pose: Array, center: Array) -> Array:
@@ -77,7 +78,7 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
     """The matrix (4, 4), and its entries' Jacobian (16, 9) by pose (6,) and centre (3,); float64."""
-    from rts.scene import rigid_loops
+    import rts.scene.rigid_loops as rigid_loops
 
     pose, center = operands
     if pose.shape != (6,) or center.shape != (3,):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.arrays.value_ranges import value_range
 from rts.errors import InputError
 from rts.operations.operation import known_value
 
 
 def check_rows(row: Array, count: int, name: str = "row") -> None:
     """Raise an InputError if `row` holds a number that is neither −1 nor an index below `count`; traced rows pass."""
-    value = known_value(row)
+    value = row if type(row) is np.ndarray else known_value(row)
     if value is None or not value.size:
         return
-    low, high = value_range(value)
+    low, high = int(np.minimum.reduce(value, None)), int(np.maximum.reduce(value, None))
     if high >= count:
         raise InputError(f"{name} refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
     if low < -1:

@@ -38,7 +38,7 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     rgba = splats.rgba
     if not splats.opaque:
         _warn_of_lost_light(splatter, splats)
-    count = shape_of(rgba)[1] - 1
+    count = rgba.shape[1] - 1
     if count == GROUP or promised(splatter, "any_channels"):
         return _cropped(splatter, splats)
     xp, alpha, images = namespace(rgba), rgba[:, count:], []
@@ -78,9 +78,10 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
 def _cropped(splatter: Splatter, splats: Splats) -> Array:
     """The image (h, w, C + 1) of splats with colours (N, C + 1), the border cut off, of pixels."""
     image, side = splatter.cropped(splats), splats.supersample
-    cells = *(n - 2 * splats.border for n in splats.row.shape[1:]), shape_of(splats.rgba)[1]
-    if side > 1 and shape_of(image) == (cells[0] // side, cells[1] // side, cells[2]):
+    _, height, width = splats.row.shape
+    cells, shape = (height - 2 * splats.border, width - 2 * splats.border, splats.rgba.shape[1]), shape_of(image)
+    if shape == (cells[0] // side, cells[1] // side, cells[2]):
         return image
-    if shape_of(image) != cells:
+    if shape != cells:
         raise InputError(f"the image of {splatter!r} {described(image)}; expected {cells} without the border")
     return averaged(image, side)

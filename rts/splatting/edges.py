@@ -61,14 +61,13 @@ class Edges(SummingSplatter):
         positions, rgba, row, stencil = splats.positions, splats.rgba, splats.row, splats.stencil
         if rgba.shape[0] == 0:
             return averaged(without_border(nothing(rgba, row), border), side)
-        check_rows(row, rgba.shape[0])
         if stencil is None:
             row = row[:1, ...] if splats.opaque else row
             stencil = _without_outlines(row, rgba)
-        else:
-            _check(stencil, rgba.shape[0], row.shape)
         if stencil.stacks is None:
             return splat(positions, rgba, row[0, ...], stencil, border, side)
+        check_rows(row, rgba.shape[0])
+        check_rows(stencil.stacks, rgba.shape[0], "stencil.stacks")
         colors, front, motion = composites(positions, rgba, row, stencil)
         still = engine_of(row).constant(np.zeros((2, *row.shape[1:]), bool), row)
         image = splat(positions, colors, front, stencil, border, side, joined=still)
@@ -98,17 +97,6 @@ class Edges(SummingSplatter):
         count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
         specs = ArraySpec((), dtype), ArraySpec((count, count), dtype), ArraySpec((count,), dtype)
         return engine.call_host(host, specs, *operands)
-
-
-def _check(stencil: Stencil, count: int, shape: tuple[int, ...]) -> None:
-    """Raise an InputError if a stencil names samples, of `count`, or composites that there are not."""
-    colors = count
-    if stencil.stacks is not None:
-        check_rows(stencil.stacks, count, "stencil.stacks")
-        colors = shape[1] * shape[2] + stencil.stacks.shape[0]
-    check_rows(stencil.color_sample, colors, "stencil.color_sample")
-    check_rows(stencil.motion_sample, count, "stencil.motion_sample")
-    check_rows(stencil.motion_colors, colors, "stencil.motion_colors")
 
 
 def _without_outlines(row: Array, like: Array) -> Stencil:

@@ -12,7 +12,7 @@ from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Stencil
 from rts.operations.operation import Arrays, Operation, Some
-from rts.splatting.cells import unpack
+from rts.splatting.cells import check_rows, unpack
 
 
 def splat(
@@ -85,19 +85,25 @@ def _inside(still: Array, motion: Array, front: Array, joined: Array) -> Array:
 def _shape(
     positions: tuple[int, ...], colors: tuple[int, ...], front: tuple[int, ...], *_: Any, border: int, supersample: int
 ) -> tuple[int, ...]:
-    return *(max(0, n - 2 * border) // supersample for n in front), colors[1]
+    height, width = max(0, front[0] - 2 * border), max(0, front[1] - 2 * border)
+    return height // supersample, width // supersample, colors[1]
 
 
 def _forward(operands: Arrays, out: np.ndarray, border: int, supersample: int) -> None:
-    from rts.splatting import stencil_loops as loops
+    import rts.splatting.stencil_loops as loops
 
-    _, colors, front, _, *of_colors = operands[:7]
+    positions, colors, front, _, *of_colors, _, motion_sample, _, motion_colors = operands
+    # Before loops read there.
+    check_rows(front, len(colors))
+    check_rows(of_colors[1], len(colors), "stencil.color_sample")
+    check_rows(motion_colors, len(colors), "stencil.motion_colors")
+    check_rows(motion_sample, len(positions), "stencil.motion_sample")
     work = 2 * out.size * supersample**2
     parallel(loops.value, len(out), border, supersample, colors, front, *of_colors, out, work=work)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, supersample: int) -> None:
-    from rts.splatting import stencil_loops as loops
+    import rts.splatting.stencil_loops as loops
 
     t_positions, t_colors = (_or_none(t, width) for t, width in zip(tangents, (3, out.shape[2]), strict=True))
     arrays = *operands[1:], t_positions, t_colors, out
@@ -105,9 +111,9 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, supers
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, border: int, supersample: int) -> None:
-    from rts.splatting import stencil_loops as loops
+    import rts.splatting.stencil_loops as loops
 
-    g_positions, g_colors = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
+    g_positions, g_colors = [np.empty((0, 3), g.dtype) if x is None else x for x in results]
     loops.pull(border, supersample, *operands[1:], read_only(g), g_positions, g_colors)
 
 

@@ -157,7 +157,7 @@ def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> Draw
     """The view of a scene that can be drawn along with others; None for one that has to be drawn by itself."""
     if settings.layers == "auto" or len(settings.bands(size)) > 1 or settings.capacity is not None:
         return None
-    grid = Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron)
+    grid = settings.grid(scene, scene.camera, size)
     return DrawnView.of(scene, grid) if at_once(grid.size) > 1 else None
 
 
@@ -170,11 +170,6 @@ def _drawn_at_once(views: Sequence[DrawnView], context: Context, settings: Rende
     return _as_pictures(pictures, [view.scene for view in views], context, settings)
 
 
-def _cells(size: tuple[int, int], settings: RenderSettings) -> tuple[int, int]:
-    """(height, width) of an image in cells."""
-    return settings.supersample * size[0], settings.supersample * size[1]
-
-
 def _images_of_scene(
     scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings
 ) -> Array:
@@ -183,7 +178,7 @@ def _images_of_scene(
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
     if settings.layers != "auto" and len(settings.bands(size)) == 1:
-        height, width = (n + 2 * settings.apron for n in _cells(size, settings))
+        height, width = (settings.supersample * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         # Which rows are in use is unknown if they are padded, so that one call must serve all views.
@@ -210,7 +205,7 @@ def _sampled(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSet
     """The samples of each view, on the host if they are found there; each core samples one at a time, if it may."""
 
     def sample_view(view_scene: Scene) -> Sampled:
-        return sampled_scene(view_scene, view_scene.camera, size, settings, stays=True)
+        return sampled_scene(view_scene, settings.grid(view_scene, view_scene.camera, size), settings, stays=True)
 
     return each(sample_view, scenes) if _concurrent(scenes[0]) else list(map(sample_view, scenes))
 
@@ -230,9 +225,11 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
 
 def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
-    pairs, splatter = zip(views, scenes, strict=True), settings.splatter
+    images, splatter = [], settings.splatter
     assert splatter is not None
-    images = [splatted(sampled, scene, scene.camera, context, splatter) for sampled, scene in pairs]
+    for sampled, scene in zip(views, scenes, strict=True):
+        grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
+        images.append(splatted(sampled, scene, grid, context, splatter))
     return namespace(*images).stack(images)
 
 

@@ -46,7 +46,8 @@ def views_to_splats(
     sampled = [picture.sampled for picture in pictures]
     sampled = owned(sampled, sampled[0].row, context)
     (height, width), border = pictures[0].picture.view, sampled[0].apron
-    grids = [Grid.around(camera, (height - 2 * border, width - 2 * border), border) for camera in cameras]
+    cells = height - 2 * border, width - 2 * border
+    grids = [Grid.of_parts(*one, cells, border, context) for one in zip(parts, cameras, strict=True)]
     shown = [
         _positions_and_colors(index, places, pictures, sampled, cameras, grids, context)
         for index, places in enumerate(itertools.zip_longest(*parts))
@@ -95,14 +96,11 @@ def _positions_and_colors(
         view.append(picture.view[index] + first if first else picture.view[index])
         first += picture.picture.views
     (view,) = concatenated([inputs.constants(numbers) for numbers in view])
-    local_cameras = [
-        g.camera.replace(view=inputs.constants(g.camera.view)).within(transform)
-        for g, transform in zip(grids, shown.transforms, strict=True)
-    ]
+    local_cameras = [g.camera if part is None else g.cameras[index] for g, part in zip(grids, parts, strict=True)]
     rows = namespace(*(camera.view for camera in local_cameras)).stack(
         context_of(*(c.view for c in local_cameras)).constants([camera.pixel_rows(size) for camera in local_cameras])
     )
-    points = on_rays(whole, shown.gbuffer["position"])
+    points = shown.gbuffer["position"] if whole.centered else on_rays(whole, shown.gbuffer["position"])
     rows, points = context_of(rows, points).constants((rows, points))
     places = _places_of(pictures, Context(engine_of(points), points))
     positions = context.constants(projective_map_of_views(rows, points, view, places))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.utils.checkpoint
+from torch.compiler import is_dynamo_compiling
 from torch.utils import _pytree
 
 from rts import Engine, InputError
@@ -17,7 +18,7 @@ from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import quoted
 from rts_backends.torch_engine import array_api, operations, torch_internals
 from rts_backends.torch_engine.functions import quiet_forward_mode, tangent_alike, transformed
-from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
+from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor, to_tensors
 
 for _cls, _split, _join in Engine.records():
     _pytree.register_pytree_node(_cls, _split, _join, serialized_type_name=f"rts.{_cls.__name__}")
@@ -37,6 +38,8 @@ FEW = 16
 """The most products of a sum that are made one by one."""
 
 _CPU = torch.device("cpu")
+_cast = np.errstate(over="ignore")(np.ndarray.astype)
+"""`astype`, by which too large numbers become infinite."""
 
 _sent: dict[tuple[int, torch.device], tuple[weakref.ref, torch.Tensor]] = {}
 """Read-only tables of the host by identity and device, and their tensors there."""
@@ -63,15 +66,12 @@ class TorchEngine(Engine):
         Of read-only tables of integers, such as a mesh's faces, one tensor is made for each device, and kept as long as
         they live: their numbers must stay, and nobody may change the result in place.
         """
-        array = np.asarray(value)
-        dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
-        if array.dtype != dtype and array.dtype.kind == "f":
-            # Too large numbers become infinite. torch takes longer for a matrix.
-            with np.errstate(over="ignore"):
-                array = array.astype(dtype, "C")
-            if like is None or like.is_cpu:
+        array, device = np.asarray(value), _CPU if like is None else like.device
+        dtype = np.float64 if like is not None and like.dtype is torch.float64 else np.float32
+        if array.dtype.kind == "f" and array.dtype != dtype:
+            array = _cast(array, dtype, "C")  # torch takes longer for a matrix.
+            if device.type == "cpu":
                 return torch.from_numpy(array)
-        device = _CPU if like is None else like.device
         if array.dtype.kind != "i" or not _is_fixed(array) or transformed():
             return to_tensor(array, device)
         key = id(array), device
@@ -92,7 +92,7 @@ class TorchEngine(Engine):
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
-        return torch.compiler.disable(f) if torch.compiler.is_compiling() else f
+        return torch.compiler.disable(f) if is_dynamo_compiling() else f
 
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
         """`x` detached."""
@@ -143,11 +143,25 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if torch.compiler.is_compiling() or torch_internals.is_legacy_batchedtensor(x):
+        if is_dynamo_compiling() or torch_internals.exporting() or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)
         return torch_internals.value_within(x, to_host)
+
+    def at_hand(self, x: torch.Tensor) -> np.ndarray | None:
+        """See `Engine.at_hand`."""
+        return self.known(x) if x.is_cpu else None
+
+    def are_known(self, arrays: Iterable[torch.Tensor]) -> bool:
+        """See `Engine.are_known`."""
+        if torch_internals.current_level() is not None or is_dynamo_compiling() or torch_internals.exporting():
+            return super().are_known(arrays)
+        return not any(map(torch_internals.is_legacy_batchedtensor, arrays))
+
+    def placed(self, arrays: Sequence[np.ndarray], like: torch.Tensor | None) -> Sequence[torch.Tensor]:
+        """See `Engine.placed`."""
+        return to_tensors(arrays, None if like is None else like.device)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,16 @@ def to_tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
     return tensor if device is None or device.type == "cpu" else tensor.to(device)
 
 
+def to_tensors(values: Iterable[Any], device: torch.device | None) -> list[torch.Tensor]:
+    """A tensor of each array or number; see `to_tensor`."""
+    tensors, here = [], device is None or device.type == "cpu"
+    for x in values:
+        # Most are arrays of the host's, made for this call.
+        ready = here and type(x) is np.ndarray and x.flags.c_contiguous and x.flags.writeable
+        tensors.append(torch.from_numpy(x) if ready else to_tensor(x, device))
+    return tensors
+
+
 def to_host(x: torch.Tensor) -> np.ndarray:
     """The detached value as NumPy, without a copy where it is on the host; both half precisions as float32."""
     x = x.detach().cpu().resolve_neg()
@@ -38,13 +48,7 @@ class _HostCall(torch.autograd.Function):
             tensor = isinstance(a, torch.Tensor)
             device = a.device if tensor and device is None else device
             values.append(to_host(a) if tensor else a)
-        results = []
-        for x in fn(*values):
-            # Most are arrays of the host's, made for this call.
-            ready = type(x) is np.ndarray and x.flags.c_contiguous and x.flags.writeable
-            ready = ready and (device is None or device.type == "cpu")
-            results.append(torch.from_numpy(x) if ready else to_tensor(x, device))
-        return tuple(results)
+        return tuple(to_tensors(fn(*values), device))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -111,7 +115,7 @@ def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[tor
 
     Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_dynamo_compiling():
         # torch annotates nothing of what `disable` returns.
         return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
     if transformed() or foreign(*[a for a in args if isinstance(a, torch.Tensor)]):

@@ -10,7 +10,7 @@ import rts
 from rts.arrays.trees import map_leaves
 from rts.contracts.checks import check_splatter
 from rts.rendering.splats import to_splats
-from rts.sampling.scene import Scene
+from rts.sampling.scene import Grid, Scene
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.splatting
@@ -31,7 +31,9 @@ def splats(splatter, size):
     layers = 1 if splatter == "edges" else 2
     sampled = rts.sample(parts, camera, size, splatter=splatter, layers=layers)
     scene = Scene.of(parts, camera, "auto", None).at(size)
-    found = to_splats(sampled, scene.parts, scene.camera, scene.camera, scene.context_with(sampled))
+    context = scene.context_with(sampled)
+    grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
+    found = to_splats(sampled, scene.parts, scene.camera, grid, context)
     return map_leaves(lambda x: x.detach(), found)
 
 
