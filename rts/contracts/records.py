@@ -198,7 +198,6 @@ class Request:
         pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
             move.
         triangles: whether to record `Cells.triangle`.
-        uniform: whether all samples of the part look alike, so that one row may stand for all cells.
         entry: the result of `Sampler.prepare_part` for this part; None where nothing was prepared.
     """
 
@@ -206,7 +205,6 @@ class Request:
     points: Array | None = None
     pairs: bool = False
     triangles: bool = False
-    uniform: bool = False
     entry: Any = None
 
 

@@ -86,20 +86,19 @@ class AtOnce:
         """The samples at centres, and those of fragments (1, 1, M) beside breaks, whose rows (M,) are told."""
         from rts.sampling import packing_loops
 
-        joint, part, depth = self._joint, seen.row, seen.depth
-        starts, known = joint.starts, (joint.proxy.ids, joint.proxy.corner_params)
-        assert self._fragments is not None
+        joint, part = self._joint, seen.row
+        starts, table, corners = joint.starts, joint.proxy.ids, joint.proxy.corner_params
+        assert self._fragments is not None and table is not None
         fragments, kept = Fragments(*(x[: len(part)] for x in self._fragments)), part >= 0
-        if uniform:  # One fragment of each part, at the first of its cells.
+        if not uniform:
+            found = packing_loops.pack(fragments, kept, table, corners, starts=starts, beside=beside)
+            counts, ids, params, row, depth, rows = found
+        else:  # One fragment of each part, at the first of its cells.
             first = packing_loops.firsts_of(part, len(starts) - 1)
-            there = first >= 0
+            there, row_of, depth = first >= 0, np.full(len(first) + 1, -1, np.int32), seen.depth
             fragments = Fragments(*(x.reshape(-1, *x.shape[3:])[first[there]] for x in fragments))
             kept = np.ones(len(fragments.depth), np.bool_)
-        counts, ids, params, row, depths, rows = packing_loops.pack(
-            fragments, kept, *known, starts=starts, beside=beside
-        )
-        if uniform:
-            row_of = np.full(len(first) + 1, -1, np.int32)
-            row_of[:-1][there] = row
-            row, depths = row_of.take(part), depth
-        return replace(joint.of_parts(counts, ids, params, Cells(row, depths)), overflow=seen.overflow), rows
+            found = packing_loops.pack(fragments, kept, table, corners, starts=starts, beside=beside)
+            counts, ids, params, row_of[:-1][there], _, rows = found
+            row = row_of.take(part)
+        return replace(joint.of_parts(counts, ids, params, Cells(row, depth)), overflow=seen.overflow), rows

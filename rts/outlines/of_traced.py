@@ -15,7 +15,7 @@ import numpy as np
 from rts.arrays.engines import Context, engine_of, is_constant, is_traced, namespace, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
-from rts.contracts.records import ArraySpec, Cells, Request, Sampled, Samples, Stencil
+from rts.contracts.records import ArraySpec, Cells, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
 from rts.outlines.found import Told, arrays_of, fits, specs
 from rts.outlines.of_joint import AtOnce
@@ -29,18 +29,21 @@ from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import DrawnView, joined
 
 
-def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int, told: Told) -> Sampled | None:
+def sampled_by_one_call(
+    scene: Scene, grid: Grid, layers: int, told: Told, uniform: bool, capacity: int | None
+) -> Sampled | None:
     """The samples of a scene with their outlines, by one call to the host.
 
     The cells of each part's samples are its rows, one after the other, −1 for those that are not in use. Samples beyond
-    `request.capacity` in a part, and breaks beyond `most_breaks`, are dropped, and counted in `overflow`.
+    `capacity` in a part, and breaks beyond `most_breaks`, are dropped, and counted in `overflow`.
 
     Args:
         scene: the scene.
         grid: the cells.
-        request: what samplers are asked for.
         layers: K.
         told: as of `with_outlines`.
+        uniform: as of `AtOnce.found`.
+        capacity: as of `Request`.
 
     Returns:
         None for values that are known, and where parts cannot be sampled along with others (`is_suited`).
@@ -54,17 +57,27 @@ def sampled_by_one_call(scene: Scene, grid: Grid, request: Request, layers: int,
     padded = scene.context.like is not None and engine.padded(scene.context.like)
     if not traced and not padded and not any(map(is_batched, operands)):
         return None
-    return _Call(scene, grid, request, layers, told, values, traced).sampled(operands)
+    return _Call(scene, grid, layers, told, uniform, capacity, values, traced).sampled(operands)
 
 
 class _Call:
     """A call to the host: the shapes of its results, and what it computes from operands.
 
-    Args are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
+    Other arguments are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
     Programs keep the call, which must not keep what was traced.
     """
 
-    def __init__(self, scene: Scene, grid: Grid, request: Request, layers: int, told: Told, values: Any, traced: bool):
+    def __init__(
+        self,
+        scene: Scene,
+        grid: Grid,
+        layers: int,
+        told: Told,
+        uniform: bool,
+        capacity: int | None,
+        values: Any,
+        traced: bool,
+    ):
         parts = [replace(part, theta={}, transform=None) for part in scene.parts]
         self._context = Context(engine_of(), np.zeros((), real_of(scene)))
         camera = scene.camera.map(lambda _: np.eye(4))  # Not read: that of the cells is among the values.
@@ -72,12 +85,12 @@ class _Call:
         self._size = grid.size
         self._layers, self._told = layers, told
         self._values = map_leaves(lambda x: x if type(x) is np.ndarray else 0.0, values)
-        self._capacity, self._request = request.capacity, replace(request, capacity=None, triangles=True)
-        self._most = most_breaks(grid, request.capacity) if traced else None
+        self._capacity, self._uniform = capacity, uniform
+        self._most = most_breaks(grid, capacity) if traced else None
         kept = 1 if all(scene.opaque) else layers
-        cells = 1 if request.uniform else layers * grid.size[0] * grid.size[1]
+        cells = 1 if uniform else layers * grid.size[0] * grid.size[1]
         beside = (self._most or 0) * told.samples(layers)
-        rows = beside + (cells if request.capacity is None else min(cells, request.capacity))
+        rows = beside + (cells if capacity is None else min(cells, capacity))
         # Without fixed shapes there is no bound.
         self._rows = rows if traced else (2**31 - 1) // len(scene.parts)
         self._surfaces: list[Any] = [part.surface for part in scene.parts]
@@ -136,10 +149,10 @@ class _Call:
 
     def _found(self, at_once: AtOnce, most: int | None) -> Sampled:
         """The samples, at most `capacity` of each part at centres, and the stencil of at most `most` breaks."""
-        seen, uniform = at_once.centres(self._layers), self._request.uniform
-        if not uniform and self._capacity is not None:
+        seen = at_once.centres(self._layers)
+        if not self._uniform and self._capacity is not None:
             seen = _limited(seen, self._capacity)
-        return at_once.found(seen, self._told, real_of(self._scene), uniform, most)
+        return at_once.found(seen, self._told, real_of(self._scene), self._uniform, most)
 
     def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         """The results of several items; None for those that cannot be drawn along with others, or lack room."""

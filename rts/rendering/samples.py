@@ -83,10 +83,10 @@ def sampled_scene(
     told = settings.told([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.
     same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
-    request = Request(capacity, triangles=outlines or settings.fronts, uniform=same)
+    request = Request(capacity, triangles=outlines or settings.fronts)
     sampled = None
     if outlines and layers != "auto" and not settings.fronts:
-        sampled = sampled_by_one_call(scene, grid, request, layers, told)
+        sampled = sampled_by_one_call(scene, grid, layers, told, same, capacity)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=apron)
     at_once, none = None, [False] * len(scene.parts)

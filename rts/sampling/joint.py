@@ -153,8 +153,8 @@ class Joint:
             else:
                 own = Cells(np.arange(stop - start, dtype=np.int32)[None, None] - np.int32(not count))
             i, p = _ids(proxy).shape[1], 2 if proxy.corner_params is None else proxy.corner_params.shape[2]
-            tables = (np.ascontiguousarray(x[start:stop, :width]) for x, width in ((ids, i), (params, p)))
-            samples.append(Samples(*tables, own, none, gbuffer_names=part.reads))
+            own_ids, own_params = (np.ascontiguousarray(x[start:stop, :n]) for x, n in ((ids, i), (params, p)))
+            samples.append(Samples(own_ids, own_params, own, none, gbuffer_names=part.reads))
         return Sampled(tuple(samples), cells, none)
 
 
@@ -172,11 +172,13 @@ def _in_one(proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]) -> Proxy:
     faces = np.concatenate([proxy.faces + np.int32(shift) for proxy, shift in zip(proxies, shifts, strict=False)])
     params = None
     if any(proxy.corner_params is not None for proxy in proxies):
-        params = [
-            _BARYCENTRICS.repeat(len(proxy.faces), 0) if proxy.corner_params is None else proxy.corner_params
-            for proxy in proxies
-        ]
-    return Proxy(np.concatenate(vertices), faces, _wide(list(map(_ids, proxies))), params and _wide(params))
+        params = _wide(
+            [
+                _BARYCENTRICS.repeat(len(proxy.faces), 0) if proxy.corner_params is None else proxy.corner_params
+                for proxy in proxies
+            ]
+        )
+    return Proxy(np.concatenate(vertices), faces, _wide([_ids(proxy) for proxy in proxies]), params)
 
 
 _BARYCENTRICS = np.array([[[1, 0], [0, 1], [0, 0]]], np.float32)

@@ -182,9 +182,7 @@ class TriangleSampler(Sampler):
         refines, moves = surface.refines, surface.refines and surface.refine_moves
         pairs = request.pairs and points is not None and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
-        # Programs of fixed shapes need no room for more than the one row.
-        capacity = 1 if request.uniform and not refines and request.capacity is None else request.capacity
-        bounds = SampleBounds(layers, cells, capacity, size, 2 * cells[1] if pairs else 0)
+        bounds = SampleBounds(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
         tables = bounds.tables(surface) if refines else {}
         beside = {
             **({"incomplete_cells": ArraySpec((), np.int32)} if moves else {}),
@@ -195,7 +193,7 @@ class TriangleSampler(Sampler):
         def find(camera: Camera, inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             host_points = np.asarray(further[0], np.float64) if further else None
             search = TriangleSearch(self, surface, part.cull, inputs, camera, bounds, tables, entry, host_points)
-            samples = search.moved() if moves else search.in_place(request.uniform, pairs)
+            samples = search.moved() if moves else search.in_place(pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, camera, bounds, entry, self.draws_at_once)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.trees import Tree
-from rts.contracts.records import ArraySpec, Fragments, Proxy, Samples
+from rts.contracts.records import ArraySpec, Fragments, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
 from rts.sampling.host_call import SampleBounds
@@ -51,13 +51,11 @@ class TriangleSearch:
     entry: Entry | None
     points: np.ndarray | None
 
-    def in_place(self, uniform: bool, pairs: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; arguments as in `Request`."""
+    def in_place(self, pairs: bool) -> Samples:
+        """Samples on the triangles, or refined by a surface that does not move them; `pairs` as in `Request`."""
         entry, fragments, covered = self._drawn(self.bounds.layers)
         ids, capacity = fragments.triangle_ids, self.bounds.capacity
         if not self.surface.refines:
-            if uniform:
-                return _of_one_row(fragments, covered, entry.proxy, capacity)
             packed = pack_fragments(fragments, entry.proxy, capacity, covered)
             return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
         unrefined = pack_fragments(fragments, entry.proxy, None, covered)
@@ -98,15 +96,6 @@ class TriangleSearch:
             return entry, fragments, check_fragments(fragments, grid, count, sampler)
 
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
-
-
-def _of_one_row(fragments: Fragments, covered: np.ndarray, proxy: Proxy, capacity: int | None) -> Samples:
-    """Samples of one row, that of the first covered cell, which all covered cells name."""
-    at = int(covered.argmax())
-    first = Fragments(*(x.reshape(covered.size, 1, 1, *x.shape[3:])[at : at + 1] for x in fragments))
-    samples = pack_fragments(first, proxy, capacity, covered.reshape(-1, 1, 1)[at : at + 1])
-    row = covered.view(np.int8) - np.int32(1)
-    return samples.replace(row=row, depth=fragments.depth, triangle=fragments.triangle_ids)
 
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:

@@ -335,7 +335,7 @@ def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
         old_p, old_q = barycentrics[k, cell, 0], barycentrics[k, cell, 1]
         before = z < old  # A branch would be mispredicted every other time.
-        if z == old:  # In clusters triangles are not in the order of their indices.
+        if z == old:  # Those seen from behind come last, not in the order of their indices.
             before = triangle < old_t
         nearest[k, place], triangle_ids[k, cell] = moved if before else old, t if before else old_t
         barycentrics[k, cell, 0], barycentrics[k, cell, 1] = p if before else old_p, q if before else old_q

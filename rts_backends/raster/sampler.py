@@ -1,8 +1,7 @@
 """Rasterizer for the CPU: the K nearest triangles of each pixel, drawn at once, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass (`rts_backends.raster.selection`) reads only
-rounded positions of their corners on screen, and lists the triangles that may cover a centre. In a large mesh that
-stays (`rts.prepare`) this pass skips whole clusters of triangles (`rts_backends.raster.clusters`).
+rounded positions of their corners on screen, and lists the triangles that may cover a centre.
 
 A second pass draws the image in bands of rows, each by one thread. For blocks of listed triangles it computes, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that these triangles
@@ -20,16 +19,9 @@ import numpy as np
 from rts import Camera, TriangleSampler
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster.clusters import SIZE, Clusters
 from rts_backends.raster.drawing import BAND_ROWS, LISTED, draw
-from rts_backends.raster.selection import LIMIT, PER_CHUNK, project, select, sorted_list
+from rts_backends.raster.selection import BLOCK, LIMIT, PER_CHUNK, project, select, sorted_list
 from rts_backends.triangles import pixel_matrix
-
-MANY = 1 << 16
-"""The least number of triangles that are put in clusters; fewer gain nothing."""
-
-ALL_IN_ORDER = read_only(np.empty(0, np.int32))
-"""An empty array in place of an order: triangles are in the order of their indices."""
 
 
 class Raster(TriangleSampler):
@@ -49,17 +41,7 @@ class Raster(TriangleSampler):
         """The state of `TriangleSampler.__getstate__` without scratch memory, of which each copy makes its own."""
         return {name: value for name, value in super().__getstate__().items() if name != "_scratch"}
 
-    def arrange(self, prepared: Any) -> Any:
-        """See `TriangleSampler.arrange`: `Clusters` of a proxy of at least `MANY` triangles; else `prepared` itself.
-
-        A subclass that overrides `rasterize`, which may expect a `Proxy`, gets `prepared` itself, too.
-        """
-        many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
-        return Clusters.of(prepared) if many and type(self).rasterize is Raster.rasterize else prepared
-
-    def rasterize(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
-    ) -> Fragments:
+    def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`.
 
         Drawn repeatedly, a mesh touches the same pages of memory, which the system clears only once. The memory has
@@ -79,7 +61,7 @@ class Raster(TriangleSampler):
 
 
 def _drawn(
-    mesh: Proxy | Clusters,
+    mesh: Proxy,
     camera: Camera,
     size: tuple[int, int],
     layers: int,
@@ -101,22 +83,18 @@ def _drawn(
     # With unsigned indices compiled code need not check for negative ones, which count from the end.
     vertices, faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
     matrix, (height, width) = pixel_matrix(camera, size), size
-    if isinstance(mesh, Clusters):
-        order, (blocks, used) = mesh.order, mesh.seen(matrix, size, keep)
-    else:
-        order = ALL_IN_ORDER
-        blocks, used = [np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (faces, vertices)]
+    used, blocks = -(-len(vertices) // BLOCK), -(-len(faces) // BLOCK)
     step = (max(size) / 2 + 2) / float(LIMIT)
     to_steps = np.diag([1 / step, 1 / step, 1, 1])
     to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
-    parallel(project, len(used), used, vertices, to_steps @ matrix, screen, work=4 * SIZE * len(used))
+    parallel(project, used, vertices, to_steps @ matrix, screen, work=4 * len(vertices))
 
-    chunks, bands = -(-len(blocks) // PER_CHUNK), -(-height // BAND_ROWS)
+    chunks, bands = -(-blocks // PER_CHUNK), -(-height // BAND_ROWS)
     # Threads should not write to neighbouring memory.
     spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, 2 * bands), np.int64)
-    geometry = blocks, faces, vertices, screen, matrix, height, width, step, keep, camera.kept_sign("back")
-    parallel(select, chunks, *geometry, (rows, spans, counts), work=10 * SIZE * len(blocks))
-    triangles = sorted_list(keep, order, rows, spans, counts)
+    geometry = faces, vertices, screen, matrix, height, width, step, keep, camera.kept_sign("back")
+    parallel(select, chunks, *geometry, (rows, spans, counts), work=10 * len(faces))
+    triangles = sorted_list(keep, rows, spans, counts)
 
     numbers = np.empty((4, layers, height * width), np.float32)  # One array, not three: the system clears fewer pages.
     ids, barycentrics, depth = numbers[0].view(np.int32), numbers[1:3].reshape(layers, -1, 2), numbers[3]

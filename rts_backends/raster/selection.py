@@ -8,18 +8,17 @@ import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
-from rts_backends.raster.clusters import SIZE
 from rts_backends.raster.drawing import BAND_ROWS
 from rts_backends.triangles import to_corner
 
-LONG_BLOCK = SIZE
-"""Triangles, or vertices, of a block in loops that keep few numbers of each."""
+BLOCK = 256
+"""Triangles, or vertices, of a block in loops that keep few numbers of each; the last may have fewer."""
 
 
 PER_CHUNK = 8
 
 
-CHUNK = PER_CHUNK * LONG_BLOCK
+CHUNK = PER_CHUNK * BLOCK
 
 
 LIMIT = np.float32(2**15 - 2)
@@ -54,33 +53,28 @@ class TriangleList(NamedTuple):
     rows: np.ndarray
 
 
-def sorted_list(
-    keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray
-) -> TriangleList:
-    """The list that `select` wrote to `rows`, `spans` and `counts`, sorted by bands of rows of pixels.
-
-    In `rows`, indices of triangles are replaced by those in the proxy, in place.
-    """
+def sorted_list(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> TriangleList:
+    """The list that `select` wrote to `rows`, `spans` and `counts`, sorted by bands of rows of pixels."""
     sums = np.add.reduce(counts, axis=0)
     of_bands = sums[::2] + sums[1::2]
     offsets = np.zeros(len(sums) + 1, np.int64)
     np.add.accumulate(sums, out=offsets[1:])
     places, items = offsets[:-1] + np.add.accumulate(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
-        parallel(_sort, len(spans), order, rows, spans, places, items, work=5 * len(items))
+        parallel(_sort, len(spans), rows, spans, places, items, work=5 * len(items))
     return TriangleList(keep, (-of_bands).argsort(), offsets, items, rows)
 
 
 @loop
-def project(first, last, used, vertices, m, screen):
+def project(first, last, vertices, m, screen):
     """Fill `screen` (V,) with positions of vertices, in steps from the image's middle.
 
-    Only the blocks `used[first:last]` of vertices are projected, by `m` (4, 4) to homogeneous steps. The lower 16 bits
+    The blocks [first, last) of vertices are projected, by `m` (4, 4) to homogeneous steps. The lower 16 bits
     are the column, the upper ones the row. Positions are clamped to ±`LIMIT`; see `BEFORE` for vertices out of view.
     """
-    points, pixels = np.empty((3, LONG_BLOCK), vertices.dtype), np.empty((2, LONG_BLOCK), np.int32)
-    for n in used[first:last]:
-        block = slice(n * LONG_BLOCK, min(len(vertices), (n + 1) * LONG_BLOCK))
+    points, pixels = np.empty((3, BLOCK), vertices.dtype), np.empty((2, BLOCK), np.int32)
+    for n in range(first, last):
+        block = slice(n * BLOCK, min(len(vertices), (n + 1) * BLOCK))
         read, written = vertices[block], screen[block]
         for v in range(len(read)):
             points[0, v], points[1, v], points[2, v] = read[v, 0], read[v, 1], read[v, 2]
@@ -100,27 +94,26 @@ def project(first, last, used, vertices, m, screen):
 
 
 @loop
-def select(first, last, blocks, faces, vertices, screen, matrix, height, width, step, keep, front, made):
+def select(first, last, faces, vertices, screen, matrix, height, width, step, keep, front, made):
     """List and count the triangles that may cover the centre of a pixel, and whose determinants may have a sign.
 
-    The search goes through chunks [first, last) of `blocks`, the indices of blocks of triangles. `keep` is the sign, 0
-    for both; `front` is that of triangles seen from the front.
+    The search goes through chunks [first, last) of blocks of triangles. `keep` is the sign, 0 for both; `front` is that
+    of triangles seen from the front.
 
     `made` is the list, to be filled: a row for each triangle (T, LISTED), where the rows of each chunk begin and end
     (chunks, 2), and the numbers of a chunk's triangles that touch each band, seen from the front and from behind
     (chunks, 2 · bands). A row begins with the triangle's index t, or −1 − t if it is seen from behind. One call writes
     its chunks one after another.
     """
-    xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
-    clips, near, behind = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
-    near_ones, step = np.empty(LONG_BLOCK, np.uint32), np.float32(step)
+    xy, box = np.empty((3, BLOCK), np.int32), np.empty((4, BLOCK), np.float32)
+    clips, near, behind = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_)
+    near_ones, step = np.empty(BLOCK, np.uint32), np.float32(step)
     signs = np.float32(keep), np.float32(front)
     geometry, place = (vertices, matrix, height, width, step), first * CHUNK
     for chunk in range(first, last):
         made[1][chunk, 0] = place
-        for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
-            start = blocks[n] * LONG_BLOCK
-            block = faces[start : min(len(faces), start + LONG_BLOCK)]
+        for start in range(chunk * CHUNK, min(len(faces), (chunk + 1) * CHUNK), BLOCK):
+            block = faces[start : min(len(faces), start + BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
             _look(len(block), xy, height, width, step, signs, box, clips, near, behind)
@@ -231,18 +224,17 @@ def _clipped_box(corners, width, height):
 
 
 @loop
-def _sort(first, last, order, rows, spans, places, items):
+def _sort(first, last, rows, spans, places, items):
     """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, 2 · bands) on.
 
-    Only chunks [first, last) are sorted; `places` move on. In the list, `order` replaces triangles' indices by those of
-    the proxy; if `order` is empty, they are the same.
+    Only chunks [first, last) are sorted; `places` move on.
     """
     for chunk in range(first, last):
         for n in range(spans[chunk, 0], spans[chunk, 1]):
             t = rows[n, 0]
             behind = t < 0
             t = -1 - t if behind else t
-            rows[n, 0] = order[t] if len(order) > 0 else t
+            rows[n, 0] = t
             for band in range(rows[n, 6] // BAND_ROWS, rows[n, 7] // BAND_ROWS + 1):
                 items[places[chunk, 2 * band + behind]] = n
                 places[chunk, 2 * band + behind] += 1

@@ -165,15 +165,6 @@ class TestRaster(SamplerConformance):
         return "raster"
 
 
-class TestClusters(SamplerConformance):
-    """Prepared triangles are in clusters, though there are few."""
-
-    @pytest.fixture
-    def sampler(self, monkeypatch):
-        monkeypatch.setattr("rts_backends.raster.sampler.MANY", 1)
-        return "raster"
-
-
 class TestReference(SamplerConformance):
     @pytest.fixture
     def sampler(self):
