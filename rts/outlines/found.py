@@ -81,7 +81,7 @@ class Outlines(NamedTuple):
         segments_loops.places(breaks.gap, breaks.place, breaks.near, place, near)
         layered = sides is not None
         sides = np.empty((count, 2, 0), np.int32) if sides is None else sides
-        of_breaks: Any = place, breaks.gap, near, breaks.slope, breaks.ends
+        of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
         return cls(rows, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
 
     def stencil(self, row: np.ndarray, told: Told, real: Any) -> Stencil:
@@ -104,10 +104,11 @@ class Outlines(NamedTuple):
             samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32))
-        found: Any = loops.entries(*arrays, real)
-        colors, motions, stacks = found
-        return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
+        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32)), real
+        found: Any = loops.entries(*arrays)
+        (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
+        stacks = stacks if self.sides.shape[2] else None
+        return Stencil(self.joined, cell, sample, weight, moved_cell, mover, rates, jumps, stacks)
 
     def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
         """The samples (B, 2) that tell motions, and those that tell colours, or −1 for the former.

@@ -63,8 +63,8 @@ def sampled_by_one_call(
 class _Call:
     """A call to the host: the shapes of its results, and what it computes from operands.
 
-    Other arguments are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes are fixed.
-    Programs keep the call, which must not keep what was traced.
+    Other arguments are those of `sampled_by_one_call`; `values` are those of `values_of`, and `traced` says that shapes
+    are fixed. Programs keep the call, which must not keep what was traced.
     """
 
     def __init__(

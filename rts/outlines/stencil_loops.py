@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
@@ -319,7 +321,7 @@ def entries(
     bands = min(BANDS, 1 + len(square) // SEGMENTS)
     lines = [0, *(int(square[len(square) * i // bands, 0]) for i in range(1, bands)), row.shape[1]]
     known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row
-    found = [()] * bands
+    found: list[Any] = [()] * bands
 
     def some(first, last):
         for i in range(first, last):

@@ -15,6 +15,8 @@ pytestmark = pytest.mark.rendering
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
+from rts.sampling import merging_loops  # noqa: E402
+
 SIZE = 40, 48
 
 
@@ -174,6 +176,38 @@ def test_triangles_are_told_where_they_are_asked_for_alone():
     own = parts(transforms)
     assert all(kinds_of(own, splatter=None))
     assert rts.sample(own, CAMERA, SIZE, engine="torch", splatter=None).triangle is None
+
+
+def test_textured_and_plain_meshes_are_drawn_in_one_pass(singly):
+    _, parts = crowd(3, moved=False)
+    own, (vertices, faces) = parts(None), box(0.5)
+    uv = {"vertices": vertices + 0.3, "uv": vertices[:, :2].astype(np.float32), "texture": np.eye(4)[..., :3] * 0.9}
+    own.insert(1, rts.Part(rts.Mesh(faces), uv, "textured"))
+    assert all(kinds_of(own))
+    np.testing.assert_array_equal(image_of(own), singly(image_of, own))
+
+
+def test_passes_are_merged_by_depth_and_equal_depths_by_triangle():
+    rng = np.random.default_rng(3)
+    layers, size, passes, start = 3, (7, 9), [], 0
+    for _ in range(3):  # Depths of few kinds, so that many are equal.
+        depth = np.sort(rng.integers(1, 5, (layers, *size)).astype(np.float32), axis=0)
+        ids = np.sort(rng.integers(0, 50, (layers, *size)), axis=0).astype(np.int32) + start
+        count, start = rng.integers(0, layers + 1, size), start + 100
+        there = np.arange(layers)[:, None, None] < count
+        ids, depth = np.where(there, ids, np.int32(-1)), np.where(there, depth, np.float32(0))
+        passes.append((ids, np.stack([ids, -ids], -1).astype(np.float32), depth))
+    merged = np.full((layers, *size), -1, np.int32), np.zeros((layers, *size, 2), np.float32), np.zeros((layers, *size))
+    merged = *merged[:2], merged[2].astype(np.float32)
+    for n in (1, 2, 0):
+        merging_loops.insert_fragments(0, size[0], *passes[n], *merged)
+    for y, x in np.ndindex(size):
+        every = [(p[2][k, y, x], p[0][k, y, x]) for p in passes for k in range(layers) if p[0][k, y, x] >= 0]
+        nearest = sorted(every)[:layers]
+        found = merged[0][:, y, x]
+        assert [t for _, t in nearest] == found[: len(nearest)].tolist() and (found[len(nearest) :] == -1).all()
+        np.testing.assert_array_equal(merged[2][: len(nearest), y, x], [z for z, _ in nearest])
+        np.testing.assert_array_equal(merged[1][: len(nearest), y, x, 0], found[: len(nearest)])
 
 
 def test_samplers_that_do_not_join_draw_each_part(singly):
