@@ -51,7 +51,7 @@ def check_sampler(sampler: Any) -> Sampler:
 def sampler_for_part(sampler: Sampler, part: Part, camera: Camera | None) -> Sampler:
     """The sampler that `sampler` selects for a part: `sampler` itself or another."""
     selected = sampler.sampler_for(part, camera)
-    return selected if selected is sampler else checked_plugin(selected, "the sampler", Sampler)
+    return selected if selected is sampler else check_sampler(selected)
 
 
 def check_splatter(splatter: Any) -> Splatter:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.utils.checkpoint
-from torch.compiler import is_dynamo_compiling
+from torch.compiler import is_compiling
 from torch.utils import _pytree
 
 from rts import Engine, InputError
@@ -92,7 +92,7 @@ class TorchEngine(Engine):
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
-        return torch.compiler.disable(f) if is_dynamo_compiling() else f
+        return torch.compiler.disable(f) if is_compiling() else f
 
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
         """`x` detached."""
@@ -143,7 +143,7 @@ class TorchEngine(Engine):
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
-        if is_dynamo_compiling() or torch_internals.exporting() or torch_internals.is_legacy_batchedtensor(x):
+        if is_compiling() or torch_internals.is_legacy_batchedtensor(x):
             return None
         if torch_internals.current_level() is None:
             return x.numpy(force=True) if x.is_cpu and x.dtype in _NUMPYS else to_host(x)
@@ -155,7 +155,7 @@ class TorchEngine(Engine):
 
     def are_known(self, arrays: Iterable[torch.Tensor]) -> bool:
         """See `Engine.are_known`."""
-        if torch_internals.current_level() is not None or is_dynamo_compiling() or torch_internals.exporting():
+        if torch_internals.current_level() is not None or is_compiling():
             return super().are_known(arrays)
         return not any(map(torch_internals.is_legacy_batchedtensor, arrays))
 

@@ -16,8 +16,7 @@ from rts_backends.torch_engine import torch_internals
 
 def transformed() -> bool:
     """True under a `torch.func` transform, in forward mode, or while `torch.compile` traces."""
-    differentiated = torch_internals.current_level() is not None or torch_internals.forward_level() >= 0
-    return differentiated or torch.compiler.is_dynamo_compiling() or torch_internals.exporting()
+    return torch_internals.differentiated() or torch.compiler.is_compiling()
 
 
 _loaded: list[bool] = []

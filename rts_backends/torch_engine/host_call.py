@@ -115,7 +115,7 @@ def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[tor
 
     Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
     """
-    if torch.compiler.is_dynamo_compiling():
+    if torch.compiler.is_compiling():
         # torch annotates nothing of what `disable` returns.
         return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
     if transformed() or foreign(*[a for a in args if isinstance(a, torch.Tensor)]):

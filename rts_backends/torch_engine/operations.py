@@ -10,19 +10,16 @@ import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
-from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.compiler import is_dynamo_compiling
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine import torch_internals
 from rts_backends.torch_engine.functions import along, foreign, is_zero
-from rts_backends.torch_engine.torch_internals import eagerly, is_asked_for, is_legacy_batchedtensor
+from rts_backends.torch_engine.torch_internals import differentiated, is_asked_for, is_legacy_batchedtensor
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -37,20 +34,18 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     `torch.compile`, and while other array code is differentiated.
     """
     real = operands[0].dtype
-    traced = is_dynamo_compiling() or torch_internals.exporting()
-    compiled = real in _DTYPES and not _specifying.on and not traced
+    compiled = real in _DTYPES and not _specifying.on and not torch.compiler.is_compiling()
     for x in operands:
         compiled = compiled and x.is_cpu and (x.dtype == real or x.dtype in _INTEGERS)
     if not compiled:
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    operands = tuple(map(torch_internals.unwrap_if_dead, map(Tensor.contiguous, operands)))
-    count = operation.differentiable
-    if torch_internals.current_level() is not None or torch_internals.forward_level() >= 0:
-        return _Value.apply(_Call(operation=operation, params=params), *operands)
+    operands, count = tuple(map(Tensor.contiguous, operands)), operation.differentiable
+    if differentiated():
+        return _Value.apply(_Call(operation, params), *operands)
     if not (torch.is_grad_enabled() and any(map(_REQUIRES_GRAD, operands[:count]))):
         return torch.from_numpy(operation.value_on_host(_host(operands), params)[0])
-    return _apply_eagerly((_Call(operation=operation, params=params), operands[count:]), *operands[:count])
+    return _Eager.apply((_Call(operation, params), operands[count:]), *operands[:count])
 
 
 class _Specifying(threading.local):
@@ -65,22 +60,26 @@ class _Specifying(threading.local):
 _specifying = _Specifying()
 
 
-class _Call(SimpleNamespace):
-    """A call of an `operation` with `params`, and the arrays that its value keeps for the derivatives.
+class _Call:
+    """A call of an operation, and the arrays that its value keeps for the derivatives.
 
     The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has a
     call of its own.
     """
 
-    kept = None
+    __slots__ = ("count", "kept", "operation", "params")
+
+    def __init__(self, operation: Operation, params: Mapping[str, Any]):
+        self.operation, self.params = operation, params
+        self.count, self.kept = operation.differentiable, None
 
     def another(self) -> _Call:
         """A call of this operation with these parameters, at other operands."""
-        return _Call(operation=self.operation, params=self.params)
+        return _Call(self.operation, self.params)
 
     def split(self, operands: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
         """The differentiable operands at the head of `operands`, and the rest."""
-        return operands[: self.operation.differentiable], operands[self.operation.differentiable :]
+        return operands[: self.count], operands[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
         """The operation's array code as a function of the differentiable operands; `fixed` are the others."""
@@ -105,7 +104,7 @@ class _Call(SimpleNamespace):
         """
         if not self.operation.second:
             return
-        if asked(0) or (any(asked(k) for k in range(1, self.operation.differentiable)) and before()):
+        if asked(0) or (any(asked(k) for k in range(1, self.count)) and before()):
             self.operation.warn_of_second()
 
     def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
@@ -169,22 +168,21 @@ class _Derivatives(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *gradients):
         call, operands, (g,) = ctx.call, ctx.saved_tensors, gradients
-        needed = ctx.needs_input_grad
-        wanted, plain = needed[1 : 1 + call.operation.differentiable], not torch.is_grad_enabled()
+        wanted = ctx.needs_input_grad[1 : 1 + call.count]
         if is_legacy_batchedtensor(g):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, g)
-        elif plain and torch_internals.current_level() is None and torch_internals.forward_level() < 0:
-            found = _Pull.forward(call, wanted, *operands, g)
-        else:
+        elif torch.is_grad_enabled() or differentiated():
             found = _Pull.apply(call, wanted, *operands, g)
-        # torch takes no gradient that is not needed, and so none that is empty.
-        return None, *found, *[None] * (len(needed) - 1 - len(wanted))
+        else:
+            found = _Pull.forward(call, wanted, *operands, g)
+        found = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        return None, *found, *[None] * (len(ctx.needs_input_grad) - 1 - call.count)
 
     @staticmethod
     def jvp(ctx, *input_tangents):
         call, operands = ctx.call, ctx.saved_tensors
-        tangents = input_tangents[1 : 1 + call.operation.differentiable]
+        tangents = input_tangents[1 : 1 + call.count]
         present = tuple(t is not None for t in tangents)
         if not any(present):
             return None
@@ -208,9 +206,6 @@ class _Eager(_Derivatives):
         ctx.save_for_backward(*operands)
         out, call.kept = call.operation.value_on_host(_host(operands), call.params)
         return torch.from_numpy(out)
-
-
-_apply_eagerly = eagerly(_Eager)
 
 
 class _Value(_Derivatives):
@@ -270,7 +265,7 @@ class _Pull(torch.autograd.Function):
     def jvp(ctx, *tangents):
         ctx.call.warn_of_second(lambda k: not is_zero(tangents[2 + k]), lambda: ctx.wanted[0])
         pull, primals, _ = _Pull._differentiable(ctx)
-        return along(pull, primals, (*tangents[2 : 2 + ctx.call.operation.differentiable], tangents[-1]))
+        return along(pull, primals, (*tangents[2 : 2 + ctx.call.count], tangents[-1]))
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
@@ -316,15 +311,14 @@ class _Push(torch.autograd.Function):
     def backward(ctx, *gradients):
         ctx.call.warn_of_second(lambda k: is_asked_for(ctx, k), lambda: _Push._moves_first(ctx))
         push, primals, fixed = _Push._differentiable(ctx)
-        found, n = torch.func.vjp(push, *primals)[1](gradients[0]), ctx.call.operation.differentiable
+        found, n = torch.func.vjp(push, *primals)[1](gradients[0]), ctx.call.count
         return None, None, *found[:n], *[None] * fixed, *found[n:]
 
     @staticmethod
     def jvp(ctx, *tangents):
         ctx.call.warn_of_second(lambda k: not is_zero(tangents[2 + k]), lambda: _Push._moves_first(ctx))
         push, primals, _ = _Push._differentiable(ctx)
-        count = ctx.call.operation.differentiable
-        return along(push, primals, (*tangents[2 : 2 + count], *tangents[-sum(ctx.present) :]))
+        return along(push, primals, (*tangents[2 : 2 + ctx.call.count], *tangents[-sum(ctx.present) :]))
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod

@@ -7,9 +7,6 @@
 - `is_asked_for` tells which derivatives a backward pass is for. Without it, warnings of some may come where others
   alone are wanted.
 - `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
-- `exporting` tells whether `torch.export` traces.
-- `eagerly` calls a `Function` outside of transforms without a look at each argument in Python; `unwrap_if_dead` finds
-  what is left over from transforms that have ended.
 
 With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
 each value read takes longer.
@@ -29,7 +26,7 @@ _T = TypeVar("_T")
 
 try:
     from torch._C import _DisableFuncTorch
-    from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor, unwrap_if_dead
+    from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor
     from torch._C._functorch import maybe_current_level as current_level
 
     def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:  # pyright: ignore[reportRedeclaration]
@@ -78,10 +75,6 @@ except ImportError:
         """0, as if some transform were active."""
         return 0
 
-    def unwrap_if_dead(tensor: Tensor) -> Tensor:
-        """The tensor itself: `Function.apply` looks for what is left over from transforms."""
-        return tensor
-
     def is_legacy_batchedtensor(tensor: Tensor) -> bool:
         """True for a tensor without values, where no transform has wrapped it."""
         return not value_within(tensor, _is_readable)
@@ -107,12 +100,6 @@ forward_level = partial(getattr, forward_ad, "_current_level", 0)
 """() → the level of forward mode, negative where it is off; 0 from a torch that does not tell."""
 
 
-exporting = torch.compiler.is_compiling
-if hasattr(torch.compiler, "_is_compiling_flag"):
-    exporting = partial(getattr, torch.compiler, "_is_compiling_flag")
-"""() → whether `torch.export` traces; `torch.compiler.is_dynamo_compiling` tells whether `torch.compile` does."""
-
-
-def eagerly(function: type[torch.autograd.Function]) -> Callable:
-    """The `apply` of a `Function` outside of transforms, whose arguments have passed `unwrap_if_dead`."""
-    return getattr(super(torch.autograd.Function, function), "apply", function.apply)
+def differentiated() -> bool:
+    """True under a `torch.func` transform, or in forward mode."""
+    return current_level() is not None or forward_level() >= 0
