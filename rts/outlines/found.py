@@ -93,9 +93,9 @@ class Outlines(NamedTuple):
             samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32))
-        colors, motions, stacks = loops.entries(*arrays, real)
-        return Stencil(self.joined, *colors, *motions, stacks if self.sides.shape[2] else None)
+        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(row, np.int32), real
+        colors, motions, stacks = loops.entries(*arrays)
+        return Stencil(self.joined, *colors, *motions, stacks=stacks if self.sides.shape[2] else None)
 
     def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
         """The samples (B, 2) that tell motions, and those that tell colours, or −1 for the former.

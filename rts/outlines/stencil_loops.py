@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
@@ -283,7 +285,7 @@ def _in_lines(
 def entries(
     place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
     joined, row, real,
-):  # fmt: skip
+) -> Any:  # fmt: skip
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
     Args:
@@ -326,14 +328,14 @@ def entries(
             found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_breaks)
 
     parallel(some, bands, work=1500 * len(square))
-    at = np.cumsum([0, *(len(order) for *_, order in found)])
-    count = int(at[-1])
-    motions = *np.empty((2, count), np.int32), np.empty((count, 3), real), np.empty((count, 2), np.int32)
+    *colors, _, _, orders = zip(*found, strict=True)
+    at = np.cumsum([0, *map(len, orders)]).tolist()
+    motions = *np.empty((2, at[-1]), np.int32), np.empty((at[-1], 3), real), np.empty((at[-1], 2), np.int32)
 
     def sort(first, last):
         for i in range(first, last):
-            _sort_motions(*found[i][3:], *(x[at[i] : at[i + 1]] for x in motions))
+            _sort_motions(*found[i][3:], *[x[at[i] : at[i + 1]] for x in motions])
 
-    parallel(sort, bands, work=20 * count)
-    cell, color, weight = (np.concatenate(x) for x in zip(*(x[:3] for x in found), strict=True))
+    parallel(sort, bands, work=20 * at[-1])
+    cell, color, weight = map(np.concatenate, colors)
     return (cell, color, weight.astype(real)), motions, stacks
