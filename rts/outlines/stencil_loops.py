@@ -188,12 +188,12 @@ def _sorted_colors(colors, parts, count, start, cells, fronts):
 
 
 @loop
-def _sort_motions(motions, rates, order, cell, sample, weight, colors):
-    """Fill in entries of motions in an order."""
-    for n in range(len(order)):
-        e = order[n]
+def _sort_motions(n, motions, rates, order, cell, sample, weight, colors):
+    """Fill in entries of motions in an order, from row n on."""
+    for e in order:
         cell[n], sample[n], colors[n, 0], colors[n, 1] = motions[e, 0], motions[e, 1], motions[e, 2], motions[e, 3]
         weight[n, 0], weight[n, 1], weight[n, 2] = rates[e, 0], rates[e, 1], rates[e, 2]
+        n += 1
 
 
 @loop
@@ -319,7 +319,7 @@ def entries(
         stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
     of_breaks = read_only(fronts), shown, movers, moves, _normals(gap, place, ties), first_stack
     bands = min(BANDS, 1 + len(square) // SEGMENTS)
-    lines = [0, *(int(square[len(square) * i // bands, 0]) for i in range(1, bands)), row.shape[1]]
+    lines = [0, *square[len(square) * np.arange(1, bands) // bands, 0].tolist(), row.shape[1]]
     known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row
     found = [()] * bands
 
@@ -334,7 +334,7 @@ def entries(
 
     def sort(first, last):
         for i in range(first, last):
-            _sort_motions(*found[i][3:], *[x[at[i] : at[i + 1]] for x in motions])
+            _sort_motions(at[i], *found[i][3:], *motions)
 
     parallel(sort, bands, work=20 * at[-1])
     cell, color, weight = map(np.concatenate, colors)
