@@ -104,7 +104,7 @@ class Outlines(NamedTuple):
             samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
         of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
         of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(np.ascontiguousarray(row, np.int32)), real
+        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(row, np.int32), real
         found: Any = loops.entries(*arrays)
         (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
         stacks = stacks if self.sides.shape[2] else None

@@ -35,8 +35,8 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     joined = np.zeros(met.shape, np.bool_)
     for sheet in sheets:
         sheet.join(fronts, met, joined)
-    marks = np.empty_like(joined)
-    parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, marks, work=fronts.part.size // 2)
+    marks, same, front = np.empty_like(joined), np.empty_like(joined), read_only(fronts.part)[None]
+    parallel(spans_loops.wanted, len(met[0]), front, joined, met, marks, same, work=fronts.part.size)
     gaps = Gaps.of(marks)
     begins, names, spans, parts = spans_on(gaps, sheets, seams)
     count = len(gaps.gap)
@@ -48,10 +48,10 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     count = counts.sum()
     gap, points, near = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
-    fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends, joined)
+    fronts_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, near, triangles, ends, same)
     slope, tangent, away = moving_edges(near, beside, triangles, points[:, 0], sheets, width)
     place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]
-    return Breaks(gap, place, near, slope, ends, last, inner, beside, joined, triangles, tangent, away)
+    return Breaks(gap, place, near, slope, ends, last, inner, beside, same, triangles, tangent, away)
 
 
 def spans_on(

@@ -26,25 +26,29 @@ SLACK = np.float32(0.01)
 
 
 @loop
-def wanted(first, last, part, joined, met, gaps):
-    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them; or `met` is 2.
+def wanted(first, last, part, joined, met, gaps, same):
+    """Fill in the gaps, in lines `first` to `last`, in which a layer may change.
 
-    Then set `joined`, where it was True if a sheet joins both centres: one part is seen at both.
+    Args:
+        first: the first line.
+        last: the line after the last.
+        part: (K, H, W) int32, the parts seen at centres.
+        joined: (2, K H, W) bool, true if a sheet joins a layer to that of the next centre; see `sheets_loops.seams`.
+        met: (2, H, W) uint8, 2 where a silhouette passes.
+        gaps: (2, H, W) bool to fill: something is seen at one of both centres that no sheet joins; or `met` is 2.
+        same: (2, H, W) bool to fill: the same parts are seen at both, and some.
     """
-    height, width = part.shape
+    layers, height, width = part.shape
     for axis in range(2):
         for y in range(first, last):
-            # Without branches, for loops that take several cells at once.
-            across, below = 1 - axis, axis if y + 1 < height else 0
-            count = width - across if y + axis < height else 0
-            for x in range(count):
-                one, other = part[y, x], part[y + below, x + across]
-                apart = (one & other) >= 0 and not joined[axis, y, x]  # −1 if nothing is seen at both.
-                gaps[axis, y, x] = apart | (met[axis, y, x] == 2)
-                joined[axis, y, x] = (one >= 0) & (one == other)
-            for x in range(count, width):
-                gaps[axis, y, x] = met[axis, y, x] == 2
-                joined[axis, y, x] = False
+            count, below = (width - 1, y) if axis == 0 else (width if y + 1 < height else 0, y + 1)
+            for x in range(width):
+                gaps[axis, y, x], same[axis, y, x] = met[axis, y, x] == 2, x < count and part[0, y, x] >= 0
+            for k in range(layers):  # Without branches, for loops that take several cells at once.
+                for x in range(count):
+                    one, other = part[k, y, x], part[k, below, x + 1 - axis]
+                    gaps[axis, y, x] |= ((one & other) >= 0) & ~joined[axis, k * height + y, x]
+                    same[axis, y, x] &= one == other
 
 
 @loop

@@ -56,7 +56,7 @@ def _gaps_to_search(
 
     And of those with the same parts, which are some, at both centres.
     """
-    from rts.outlines import stacks_loops as loops
+    from rts.outlines import spans_loops
 
     count, *size = layers.part.shape
     ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
@@ -70,30 +70,28 @@ def _gaps_to_search(
     for sheet in sheets:
         sheet.join(below, met, joined)
     marks, same = np.empty(met.shape, np.bool_), np.empty(met.shape, np.bool_)
-    parallel(loops.wanted, size[0], read_only(layers.part), joined, met, marks, same, work=2 * layers.part.size)
+    parallel(spans_loops.wanted, size[0], read_only(layers.part), joined, met, marks, same, work=2 * layers.part.size)
     return marks, same
 
 
 def _changes(
     gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], seams: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
     """The changes of stacks along gaps; see `stacks_loops.changes`."""
     from rts.outlines import stacks_loops as loops
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
     begins, names, spans, parts = spans_on(gaps, sheets, seams)
-    seen = read_only(layers.part), read_only(layers.depth)
     rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
     room = ROOM * (begins + 2 * np.arange(count + 1))
     while True:
         total = int(room[-1])
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        known = gap, begins, spans, names, parts, opaque, *seen, room, rows, counts
+        known = gap, begins, spans, names, parts, opaque, *map(read_only, layers[::2]), room, rows, counts
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
             break
         room = np.append(0, np.cumsum(counts))  # Many surfaces pass through one another.
     at = np.repeat(rows - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
-    whole, place, samples, places, sides = (x.take(at, 0) for x in found)
-    return whole, place, samples, places, sides
+    return tuple(x.take(at, 0) for x in found)

@@ -31,32 +31,6 @@ PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE, EDGES = range(8)
 −1; 1 if its run is real; 1 if the run is, or has been, in the stack; the last of the span's `names`."""
 
 
-@loop
-def wanted(first, last, part, joined, met, gaps, same):
-    """Fill in the gaps, in lines `first` to `last`, in which a layer may change.
-
-    Args:
-        first: the first line.
-        last: the line after the last.
-        part: (K, H, W) int32, the parts seen at centres.
-        joined: (2, K H, W) bool, true if a sheet joins a layer to that of the next centre; see `sheets_loops.seams`.
-        met: (2, H, W) uint8, 2 where a silhouette passes.
-        gaps: (2, H, W) bool to fill: something is seen at one of both centres that no sheet joins; or `met` is 2.
-        same: (2, H, W) bool to fill: the same parts are seen at both, and some.
-    """
-    layers, height, width = part.shape
-    for axis in range(2):
-        for y in range(first, last):
-            count, below = (width - 1, y) if axis == 0 else (width if y + 1 < height else 0, y + 1)
-            for x in range(width):
-                gaps[axis, y, x], same[axis, y, x] = met[axis, y, x] == 2, x < count and part[0, y, x] >= 0
-            for k in range(layers):  # Without branches, for loops that take several cells at once.
-                for x in range(count):
-                    one, other = part[k, y, x], part[k, below, x + 1 - axis]
-                    gaps[axis, y, x] |= ((one & other) >= 0) & ~joined[axis, k * height + y, x]
-                    same[axis, y, x] &= one == other
-
-
 @compiled(inline="always")
 def _alike(own, i, j, place):
     """True if two spans have about one depth at a place."""
@@ -204,14 +178,15 @@ def _meeting(own, i, j, low, high):
 @compiled(inline="always")
 def _next_meeting(stack, count, own, place, until):
     """The next place at which two neighbours in a stack pass through one another, and the first's index; or −1."""
-    best, at = np.inf, -1
+    best, at, z = np.inf, -1, depth_at(own, stack[0], until) if count > 0 else 0.0
     for m in range(count - 1):
         i, j = stack[m], stack[m + 1]
-        z = depth_at(own, i, until)
-        if depth_at(own, j, until) < z - MARGIN * abs(z):
+        beyond = depth_at(own, j, until)
+        if beyond < z - MARGIN * abs(z):
             there = _meeting(own, i, j, place, until)
             if there < best:
                 best, at = there, m
+        z = beyond
     return best, at
 
 

@@ -107,9 +107,10 @@ def _add_sides(
                     continue
                 for other in range(len(row)):
                     stays |= stack[b, 1 - i, other] == there
+                moves = along if stays else across
                 for at, share in shares:
-                    for sample in (own, there):
-                        m = _add_motion(motions, rates, m, at, sample, share, along if stays else across, further, here)
+                    m = _add_motion(motions, rates, m, at, own, share, moves, further, here)
+                    m = _add_motion(motions, rates, m, at, there, share, moves, further, here)
                 further += 1
     return n, m
 
@@ -188,12 +189,12 @@ def _sorted_colors(colors, parts, count, start, cells, fronts):
 
 
 @loop
-def _sort_motions(motions, rates, order, cell, sample, weight, colors):
-    """Fill in entries of motions in an order."""
-    for n in range(len(order)):
-        e = order[n]
+def _sort_motions(n, motions, rates, order, cell, sample, weight, colors):
+    """Fill in entries of motions in an order, from row n on."""
+    for e in order:
         cell[n], sample[n], colors[n, 0], colors[n, 1] = motions[e, 0], motions[e, 1], motions[e, 2], motions[e, 3]
         weight[n, 0], weight[n, 1], weight[n, 2] = rates[e, 0], rates[e, 1], rates[e, 2]
+        n += 1
 
 
 @loop
@@ -285,7 +286,7 @@ def _in_lines(
 def entries(
     place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
     joined, row, real,
-):  # fmt: skip
+) -> Any:  # fmt: skip
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
     Args:
@@ -319,7 +320,7 @@ def entries(
         stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
     of_breaks = read_only(fronts), shown, movers, moves, _normals(gap, place, ties), first_stack
     bands = min(BANDS, 1 + len(square) // SEGMENTS)
-    lines = [0, *(int(square[len(square) * i // bands, 0]) for i in range(1, bands)), row.shape[1]]
+    lines = [0, *square[len(square) * np.arange(1, bands) // bands, 0].tolist(), row.shape[1]]
     known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row
     found: list[Any] = [()] * bands
 
@@ -328,14 +329,14 @@ def entries(
             found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_breaks)
 
     parallel(some, bands, work=1500 * len(square))
-    at = np.cumsum([0, *(len(order) for *_, order in found)])
-    count = int(at[-1])
-    motions = *np.empty((2, count), np.int32), np.empty((count, 3), real), np.empty((count, 2), np.int32)
+    *colors, _, _, orders = zip(*found, strict=True)
+    at = np.cumsum([0, *map(len, orders)]).tolist()
+    motions = *np.empty((2, at[-1]), np.int32), np.empty((at[-1], 3), real), np.empty((at[-1], 2), np.int32)
 
     def sort(first, last):
         for i in range(first, last):
-            _sort_motions(*found[i][3:], *(x[at[i] : at[i + 1]] for x in motions))
+            _sort_motions(at[i], *found[i][3:], *motions)
 
-    parallel(sort, bands, work=20 * count)
-    cell, color, weight = (np.concatenate(x) for x in zip(*(x[:3] for x in found), strict=True))
+    parallel(sort, bands, work=20 * at[-1])
+    cell, color, weight = map(np.concatenate, colors)
     return (cell, color, weight.astype(real)), motions, stacks

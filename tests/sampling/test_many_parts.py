@@ -181,7 +181,11 @@ def test_triangles_are_told_where_they_are_asked_for_alone():
 def test_textured_and_plain_meshes_are_drawn_in_one_pass(singly):
     _, parts = crowd(3, moved=False)
     own, (vertices, faces) = parts(None), box(0.5)
-    uv = {"vertices": vertices + 0.3, "uv": vertices[:, :2].astype(np.float32), "texture": np.eye(4)[..., :3] * 0.9}
+    uv = {
+        "vertices": vertices + 0.3,
+        "uv": vertices[:, :2].astype(np.float32),
+        "texture": np.random.default_rng(0).uniform(0, 0.9, (4, 4, 3)),
+    }
     own.insert(1, rts.Part(rts.Mesh(faces), uv, "textured"))
     assert all(kinds_of(own))
     np.testing.assert_array_equal(image_of(own), singly(image_of, own))
