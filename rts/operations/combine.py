@@ -62,8 +62,8 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     plain = len(ids_shape) == len(weights_shape) == 2
     if not plain or not 0 <= column <= ids_shape[1] - 3 or weights_shape[1] < 2 or ids_shape[0] != weights_shape[0]:
         raise InputError(
-            f"samples have ids of shape {ids_shape} and parameters of shape {weights_shape}; expected "
-            f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
+            f"samples have ids of shape {tuple(ids_shape)} and parameters of shape {tuple(weights_shape)}; "
+            f"expected (N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
         )
     return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)
 

@@ -18,7 +18,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
-from rts.testing.claims import claim, claim_close, no_error, refusal
+from rts.testing.claims import claim, no_error, refusal
 from rts.testing.compatibility import APRON
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
@@ -225,17 +225,6 @@ class SamplerConformance(Conformance):
         ids = surface.proxy(surface.proxy_inputs(part.theta), scenes.CAMERA, scenes.SIZE).faces[triangle[row >= 0]]
         same = np.array_equal(np.asarray(found.ids)[row[row >= 0]], ids)
         claim(same or surface.refines, "samples do not lie on the triangles that are told")
-
-    def test_one_row_stands_for_all_cells_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
-        """With `Request.uniform` cells are covered as without, at the same depths, whatever rows they name."""
-        chosen, part = check_sampler(sampler), scenes.checked(parts[0])
-        whole, one = (
-            chosen.sample(part, scenes.CAMERA, scenes.SIZE, 1, Request(uniform=uniform)) for uniform in (False, True)
-        )
-        covered, row = np.asarray(whole.row) >= 0, np.asarray(one.row)
-        claim(((row >= 0) == covered).all(), "other cells are covered with `uniform`")
-        claim(row.max() < len(one.ids), f"row names sample {row.max()} of {len(one.ids)}")
-        claim_close(np.asarray(one.depth), np.asarray(whole.depth), 1e-6, "depths with `uniform`")
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """A surface with neither triangles nor `intersect` raises an `rts.RtsError` of one line."""

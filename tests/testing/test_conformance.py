@@ -559,15 +559,14 @@ def without_the_last_layer(found):
 
 
 class OddTriangles(type(rts.plugin("samplers", "raster")())):
-    """Tells triangles, or cells of one row, that are altered."""
+    """Tells triangles that are altered."""
 
-    def __init__(self, alter, uniform=False):
-        self.alter, self.uniform = alter, uniform
+    def __init__(self, alter):
+        self.alter = alter
 
     def sample(self, part, camera, size, layers, request):
         found = super().sample(part, camera, size, layers, request)
-        asked = request.uniform if self.uniform else found.triangle is not None
-        return self.alter(found) if asked else found
+        return found if found.triangle is None else self.alter(found)
 
 
 SAMPLERS = {
@@ -583,10 +582,6 @@ SAMPLERS = {
     "triangles_are_told_where_it_says_so": {
         "everywhere": OddTriangles(lambda found: found.replace(triangle=np.maximum(found.triangle, 0))),
         "others": OddTriangles(lambda found: found.replace(triangle=found.triangle + (found.triangle == 0))),
-    },
-    "one_row_stands_for_all_cells_where_it_says_so": {
-        "fronts lost": OddTriangles(lambda found: found.replace(row=found.row * 0 - 1), uniform=True),
-        "no such row": OddTriangles(lambda found: found.replace(row=found.row + (found.row >= 0)), uniform=True),
     },
     "points_are_sampled_as_centres_are": {
         "half a cell aside": AtPoints(lambda points: points + 0.5),
