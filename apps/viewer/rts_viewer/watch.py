@@ -187,7 +187,9 @@ class Watch:
         return State(int(number), float(loss), points, table, shades)
 
     def _label(self) -> None:
-        """Say on the buttons what they do, and have the page brought up to date."""
+        """Say on the buttons what they do, and have the page brought up to date, unless it is closed."""
+        if self._closing.is_set():
+            return
         self._pause_button.label = "go on" if self.paused else "pause"
         self._pause_button.disabled = self._over or self._stopped
         self._stop_button.label = "close" if self._over else "stop"

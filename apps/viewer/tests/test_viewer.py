@@ -236,6 +236,15 @@ def test_stop_ends_a_fit_even_a_paused_one(paused):
         assert watch.step(0, 1.0, vertices, faces) is False
 
 
+def test_a_fit_may_be_stopped_after_the_page_is_closed():
+    vertices, faces, _ = ball()
+    with watching() as watch:
+        watch.begin()
+    for press in (watch.pause, watch.go_on, watch.stop, watch.end):
+        press()
+    assert watch.step(0, 1.0, vertices, faces) is True
+
+
 def test_pictures_that_are_read_while_the_page_closes_are_left_out(monkeypatch):
     failures, reading, gone = [], threading.Event(), threading.Event()
     monkeypatch.setattr(threading, "excepthook", failures.append)
