@@ -428,13 +428,6 @@ ARRAYS = [
         "many_parts",
     ),
     Defect(
-        "samples beside outlines come before those at centres",
-        "rts/sampling/packing_loops.py",
-        "        for piece in range(len(ahead)):\n",
-        "        for piece in range(len(ahead) - 1, -1, -1):\n",
-        "packing_invariants many_parts edges",
-    ),
-    Defect(
         "parts without a row share one with the next",
         "rts/sampling/packing_loops.py",
         "total = max(n, total + 1)",
