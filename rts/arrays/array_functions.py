@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -173,7 +172,7 @@ def is_finite(*arrays: Array, below: float = math.inf) -> bool:
             continue
         # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
         if 0 in values.strides:
-            values = values[tuple(map({0: slice(1)}.get, values.strides, repeat(slice(None))))]
+            values = values[tuple([slice(None) if step else slice(1) for step in values.strides])]
         if not largest_absolute(values) < below:
             return False
     return True

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import described, is_finite
+from rts.arrays.array_functions import described, is_finite, shape_of
 from rts.arrays.engines import floating_bits, value_of
 from rts.arrays.trees import Array, placed_leaves
 from rts.contracts.checked_parts import CheckedPart
@@ -32,7 +32,7 @@ def check_attribute(surface: Any, count: int, name: str, value: Any) -> None:
 
 def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
     """Refuse a shader's result unless it is (count, C + 1), C its channels, and its numbers are floating."""
-    expected, shape = (count, shader.channels + 1), tuple(getattr(rgba, "shape", ()))
+    expected, shape = (count, shader.channels + 1), shape_of(rgba)
     if shape != expected:
         other = len(shape) == 2 and shape[0] == count and shape[1] > 4
         hint = f": {shader.channels} channels and alpha, as its attribute `channels` says" if other else ""

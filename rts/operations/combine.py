@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -57,12 +56,11 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: shapes of ids and weights do not fit; or, on the host, an id is no index of a row.
     """
-    ids_shape: Any = getattr(ids, "shape", ())
-    weights_shape: Any = getattr(weights, "shape", ())
+    ids_shape, weights_shape = shape_of(ids), shape_of(weights)
     plain = len(ids_shape) == len(weights_shape) == 2
     if not plain or not 0 <= column <= ids_shape[1] - 3 or weights_shape[1] < 2 or ids_shape[0] != weights_shape[0]:
         raise InputError(
-            f"samples have ids of shape {tuple(ids_shape)} and parameters of shape {tuple(weights_shape)}; "
+            f"samples have ids of shape {ids_shape} and parameters of shape {weights_shape}; "
             f"expected (N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
         )
     return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)

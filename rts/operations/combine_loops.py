@@ -20,7 +20,7 @@ def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
     named = ids[:, column : column + count]
     if not named.size:
         return
-    for index in (np.maximum.reduce(named, None), np.minimum.reduce(named, None)):
+    for index in (named.max(), named.min()):
         if not 0 <= index < len(rows):
             raise InputError(f"the ids of samples refer to row {index} of {len(rows)} rows; sample this surface anew")
 

@@ -39,7 +39,7 @@ def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
-    import rts.operations.take_loops as take_loops
+    from rts.operations import take_loops
 
     rows, index = operands
     index, bad = read_only(index, np.int32 if index.dtype.itemsize < 8 else np.int64), np.zeros(1, np.bool_)

@@ -39,7 +39,7 @@ class AtOnce:
         return cls(Joint.of(scene, grid), grid, opaque) if suited else None
 
     def centres(self, layers: int) -> Sampled:
-        """What is seen at centres (K, H, W): `Sampled.row` has parts, `samples` are told by `found`."""
+        """The surfaces seen at centres (K, H, W). `Sampled.row` has parts, or −1; `found` tells the samples."""
         from rts.outlines import samples_loops
         from rts.sampling import packing_loops
 

@@ -229,7 +229,7 @@ class _Call:
 
 
 def _limited(seen: Sampled, capacity: int) -> Sampled:
-    """What is seen at centres, at most so much of each part; what is left out lies in its last layers."""
+    """The surfaces seen at centres, at most `capacity` cells of each part; its last layers are left out first."""
     part = seen.row.reshape(-1)
     order = np.argsort(part, kind="stable")
     ordered = part[order]

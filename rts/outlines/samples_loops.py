@@ -1,4 +1,4 @@
-"""Which samples outlines need: of what is seen at centres, and beside breaks. Compiled."""
+"""The surfaces seen at centres, and the samples that are needed beside breaks. Compiled."""
 
 from __future__ import annotations
 

@@ -74,6 +74,7 @@ class Sheets(NamedTuple):
             keep: see above; None for what `cull` says.
         """
         from rts.outlines import sheets_loops, silhouettes_loops
+        from rts.sampling.packing_loops import in_one
 
         # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
@@ -85,14 +86,11 @@ class Sheets(NamedTuple):
         else:  # Of one colour triangles that meet are one sheet, whether they share their vertices or not.
             tables = [_welded(x.vertices, x.faces) for x in every]
             if any(table is not x.faces for table, x in zip(tables, every, strict=True)):
-                shifts = np.cumsum([0, *(len(x.vertices) for x in every)], dtype=np.int32)
-                moved = [table + shift for table, shift in zip(tables, shifts, strict=False)]
-                faces = read_only(tables[0] if len(moved) == 1 else np.concatenate(moved), np.int32)
+                shifts = [0, *itertools.accumulate(len(x.vertices) for x in every)][:-1]
+                faces = read_only(tables[0] if len(tables) == 1 else in_one(tables, shifts), np.int32)
         starts = np.array([0, *itertools.accumulate(map(len, tables))], np.int32)
         beyond = [_beyond(table) for table in tables]
-        if len(beyond) > 1:
-            beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
-        beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
+        beyond = beyond[0] if len(beyond) == 1 else in_one(beyond, starts[:-1].tolist())
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))
         keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
         return cls(first, starts, vertices, faces, beyond, rows, near_and_far(camera), keep, seen, sides)

@@ -132,7 +132,6 @@ class HostCall:
         if not self._surface.centered:
             tables[ON_RAYS] = self._bounds.row_spec(np.float32, 3)._replace(by_sample=True)
 
-        by_sample = [name for name, spec in tables.items() if spec.by_sample]
         # Programs keep the function, which must not keep what was traced.
         moves, further_ones, entry = len(self._transform), len(arrays), self._entry
         places, surface, theta = map_leaves(lambda _: 0.0, self._inputs), self._surface, self._theta
@@ -151,7 +150,7 @@ class HostCall:
             inputs = self._inputs if entry is None else entry.inputs
             found, filled, more = complete(on_host(self._camera), self._transform, inputs, arrays)
             cells = Cells(found.row, found.depth)
-            return self._packed(by_sample, None, found.ids, found.params, cells, found.overflow, filled), dict(more)
+            return self._packed(found.ids, found.params, cells, found.overflow, filled, tables), dict(more)
 
         def host(*operands: np.ndarray) -> tuple[Any, ...]:
             it = iter(operands)
@@ -174,13 +173,30 @@ class HostCall:
         results = iter(self._engine.call_host(OnAllCores(host) if self._concurrent else host, specs, *operands))
         ids, params, row, depth, overflow = islice(results, len(sample_specs))
         more, filled, attributes = (dict(zip(x, results, strict=False)) for x in (beside, tables, self._attributes))
-        return self._packed(by_sample, attributes, ids, params, Cells(row, depth), overflow, filled), more
+        return self._packed(ids, params, Cells(row, depth), overflow, filled, tables, attributes), more
 
-    def _packed(self, by_sample: Sequence[str], attributes: Mapping[str, Array] | None, *fields: Any) -> Samples:
-        """Samples of the part with these fields, the first five; tables of these names have a row for each sample."""
-        gbuffer, centered = None if self._theta is None else attributes, self._surface.centered
-        ids, params, cells, overflow, tables = fields
-        return Samples(ids, params, cells, overflow, tables, gbuffer, self._reads, centered, tuple(by_sample))
+    def _packed(
+        self,
+        ids: Array,
+        params: Array,
+        cells: Cells,
+        overflow: Array,
+        filled: Mapping[str, Array],
+        tables: Mapping[str, ArraySpec],
+        attributes: Mapping[str, Array] | None = None,
+    ) -> Samples:
+        """Samples of the part, with the tables of these specs."""
+        return Samples(
+            ids,
+            params,
+            cells,
+            overflow,
+            tables=filled,
+            gbuffer=None if self._theta is None else attributes,
+            gbuffer_names=self._reads,
+            centered=self._surface.centered,
+            by_sample=tuple([name for name, spec in tables.items() if spec.by_sample]),
+        )
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:

@@ -28,7 +28,7 @@ MOST = 2**15
 
 
 class Draw(NamedTuple):
-    """What a sampler draws in one pass.
+    """The triangles that a sampler draws in one pass.
 
     Attributes:
         sampler: the sampler.
@@ -168,9 +168,10 @@ def _ids(proxy: Proxy) -> np.ndarray:
 
 def _in_one(proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]) -> Proxy:
     """Several proxies as one, whose vertices are given; tables are as wide as the widest, filled up with 0."""
-    shifts = itertools.accumulate(map(len, vertices), initial=0)
-    faces = np.concatenate([proxy.faces + np.int32(shift) for proxy, shift in zip(proxies, shifts, strict=False)])
-    params = None
+    from rts.sampling.packing_loops import in_one
+
+    shifts, params = [0, *itertools.accumulate(map(len, vertices))][:-1], None
+    faces = in_one([proxy.faces for proxy in proxies], shifts)
     if any(proxy.corner_params is not None for proxy in proxies):
         params = _wide(
             [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,24 @@ _NO_PARTS, _NONE = np.empty(0, np.int32), read_only(np.empty((0, 3, 0), np.float
 
 _NOTHING = Fragments(np.empty(0, np.int32), np.empty((0, 2), np.float32), np.empty(0, np.float32))
 _NOWHERE = np.empty(0, np.bool_)
+
+
+def in_one(tables: Sequence[np.ndarray], shifts: Sequence[int]) -> np.ndarray:
+    """Several tables (T, 3) int32 of indices as one; to those of each, but −1, its shift is added."""
+    whole, start = np.empty((sum(map(len, tables)), 3), np.int32), 0
+    for table, shift in zip(tables, shifts, strict=True):
+        own = whole[start : start + len(table)]
+        parallel(_shift, len(table), read_only(table, np.int32), np.int32(shift), own, work=3 * len(table))
+        start += len(table)
+    return whole
+
+
+@loop
+def _shift(first, last, table, shift, shifted):
+    """`in_one`, of some rows of a table."""
+    for t in range(first, last):
+        for c in range(3):
+            shifted[t, c] = table[t, c] + shift if table[t, c] >= 0 else table[t, c]
 
 
 def owners_of(starts: np.ndarray) -> np.ndarray:

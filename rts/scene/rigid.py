@@ -31,7 +31,7 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     Raises:
         InputError: `pose` or `center` has another shape, or is not finite.
     """
-    if getattr(pose, "shape", None) != (6,):
+    if shape_of(pose) != (6,):
         if shape_of(pose)[1:] == (6,):
             several = f"pose has shape {shape_of(pose)}; expected (6,), one pose"
             raise InputError(f"{several}: stack the results of rts.rigid, or take torch.vmap or jax.vmap of it")
@@ -78,7 +78,7 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
     """The matrix (4, 4), and its entries' Jacobian (16, 9) by pose (6,) and centre (3,); float64."""
-    import rts.scene.rigid_loops as rigid_loops
+    from rts.scene import rigid_loops
 
     pose, center = operands
     if pose.shape != (6,) or center.shape != (3,):
