@@ -42,10 +42,12 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     size = breaks.joined.shape[1:]
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, *size)
     # By squares; in each of them clockwise, part by part if outlines may cross.
-    group, order = square, loops.order_of(square, along)
+    group, order = square, square.argsort(kind="stable")
+    loops.turn_clockwise(order, group, along)
     if layered:
         group = loops.groups_of(order, square, ends)
-        order = loops.order_of(group, along)
+        order = group.argsort(kind="stable")
+        loops.turn_clockwise(order, group, along)
     known = breaks.place, breaks.tangent
     of_breaks = *known, breaks.cells_away
     origin, ties, square_sides, neighbours = loops.segments_of(order, group, square, ends, *of_breaks, size[1])

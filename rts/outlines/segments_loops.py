@@ -120,9 +120,9 @@ def _odd(first, stop, order, ends, e):
 
 
 @loop
-def order_of(group, along):
-    """(E,) int64: sorts ends by groups (E,) int64, and in each clockwise, by `along` (E,)."""
-    order, begin = np.argsort(group, kind="mergesort"), 0
+def turn_clockwise(order, group, along):
+    """Sort, in `order` (E,) int64, which has ends by groups (E,), those of each group by `along` (E,)."""
+    begin = 0
     for n in range(len(order)):
         end, m = order[n], n
         if n == 0 or group[order[n - 1]] != group[end]:
@@ -131,7 +131,6 @@ def order_of(group, along):
             order[m] = order[m - 1]
             m -= 1
         order[m] = end
-    return order
 
 
 @loop

@@ -18,9 +18,6 @@ TINY = 1e-9
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
 
-FEW = 32
-"""Spans of a gap that are sorted one by one, which is the fastest way for so few."""
-
 SLACK = np.float32(0.01)
 """By how much boxes of triangles are larger than these, against rounding, in cells."""
 
@@ -354,16 +351,25 @@ def by_gap(gaps, count):
 
 @loop
 def by_start(first, last, begins, starts, order):
-    """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start."""
+    """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start.
+
+    Of those that start in one place the earlier span comes first. Shell's sort: most gaps have a few spans.
+    """
     for g in range(first, last):
-        begin, stop = begins[g], begins[g + 1]
-        if stop - begin > FEW:
-            own = order[begin:stop]
-            own[:] = own[np.argsort(starts[own], kind="mergesort")]
-            continue
-        for n in range(begin + 1, stop):
-            span, m = order[n], n
-            while m > begin and starts[order[m - 1]] > starts[span]:
-                order[m] = order[m - 1]
-                m -= 1
-            order[m] = span
+        begin, stop, step = begins[g], begins[g + 1], 1
+        while 3 * step < stop - begin:
+            step = 3 * step + 1
+        while step > 0:
+            for n in range(begin + step, stop):
+                span, m = order[n], n
+                while m - step >= begin and _is_later(order[m - step], span, starts):
+                    order[m] = order[m - step]
+                    m -= step
+                order[m] = span
+            step //= 3
+
+
+@compiled(inline="always")
+def _is_later(i, j, starts):
+    """True if span i comes after j."""
+    return starts[i] > starts[j] or (starts[i] == starts[j] and i > j)
