@@ -394,14 +394,14 @@ ARRAYS = [
     ),
     Defect(
         "the farther of two layers moves a break",
-        "rts/outlines/gaps.py",
+        "rts/outlines/halving.py",
         "(depths[1] < depths[0]).astype(np.int32)",
         "(depths[1] > depths[0]).astype(np.int32)",
         "field_outlines breaks_of_fields",
     ),
     Defect(
         "slopes are taken beyond a crossing",
-        "rts/outlines/gaps.py",
+        "rts/outlines/halving.py",
         "inward, across = way * BESIDE * step,",
         "inward, across = -way * BESIDE * step,",
         "breaks_of_fields",

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
 
-from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.gbuffer import GBuffer
-from rts.contracts.shader import Shader
 from rts.errors import InputWarning, warn
-from rts.shading.pbr import MAPS
 from rts.shading.tangents import TANGENT
-from rts.shading.textures import own_uv
+from rts.shading.textures import MAPS, own_uv
 from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
@@ -83,51 +78,3 @@ def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
                     f"entries",
                     InputWarning,
                 )
-
-
-class Observed(Shader):
-    """A wrapper of a shader that records the entries of θ that it reads.
-
-    Attributes:
-        read: the names of entries read so far.
-    """
-
-    def __init__(self, shader: Shader):
-        self._shader, self.channels = shader, shader.channels
-        self.read: set[str] = set()
-
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
-        """The colours of the wrapped shader."""
-        return self._shader(_Noting(theta, self.read), gbuffer, camera)
-
-
-class _Noting(dict):
-    """A dict that adds to `read` every name looked up, present or not; iteration adds all names."""
-
-    def __init__(self, entries: Mapping[str, Any], read: set[str]):
-        super().__init__(entries)
-        self._read = read
-
-    def __getitem__(self, name: str) -> Any:
-        self._read.add(name)
-        return super().__getitem__(name)
-
-    def __contains__(self, name: object) -> bool:
-        self._read.add(str(name))
-        return super().__contains__(name)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self else default
-
-    def __iter__(self) -> Iterator[str]:
-        self._read.update(super().__iter__())
-        return super().__iter__()
-
-    def keys(self) -> Any:
-        return dict.fromkeys(self).keys()
-
-    def items(self) -> Any:
-        return {name: self[name] for name in self}.items()
-
-    def values(self) -> Any:
-        return dict(self.items()).values()

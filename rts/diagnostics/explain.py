@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.advice.unread_entries import Observed, likely_name, shaded_by, unread
+from rts.advice.unread_entries import likely_name, shaded_by, unread
 from rts.advice.winding import INSIDE_OUT, is_inside_out
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array, Tree
@@ -83,17 +83,57 @@ def explain(
     return [choice._replace(samples=n) for choice, n in zip(choices, map(_count, sampled.samples), strict=True)]
 
 
-class _Watched(Observed):
-    """A wrapper of a shader that records the entries of θ that it reads, and whether its colours step on a surface."""
+class _Watched(Shader):
+    """A wrapper of a shader that records the entries of θ that it reads, and whether its colours step on a surface.
 
-    steps = False
+    Attributes:
+        read: the names of entries read so far.
+        steps: whether colours have stepped so far.
+    """
+
+    def __init__(self, shader: Shader):
+        self._shader, self.channels = shader, shader.channels
+        self.read: set[str] = set()
+        self.steps = False
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
         """The colours of the wrapped shader."""
-        colors = super().__call__(theta, gbuffer, camera)
+        colors = self._shader(_Noting(theta, self.read), gbuffer, camera)
         if _is_own(self._shader):
             self.steps |= steps_inside(lambda between: self._shader(theta, between, camera), gbuffer, camera)
         return colors
+
+
+class _Noting(dict):
+    """A dict that adds to `read` every name looked up, present or not; iteration adds all names."""
+
+    def __init__(self, entries: Mapping[str, Any], read: set[str]):
+        super().__init__(entries)
+        self._read = read
+
+    def __getitem__(self, name: str) -> Any:
+        self._read.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self._read.add(str(name))
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
+    def __iter__(self) -> Iterator[str]:
+        self._read.update(super().__iter__())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        return dict.fromkeys(self).keys()
+
+    def items(self) -> Any:
+        return {name: self[name] for name in self}.items()
+
+    def values(self) -> Any:
+        return dict(self.items()).values()
 
 
 def _is_own(shader: Shader) -> bool:

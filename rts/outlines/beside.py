@@ -12,7 +12,6 @@ from rts.outlines.found import Told
 from rts.outlines.gaps import Breaks, Fronts, Stacks
 from rts.outlines.sheets import Sheets
 from rts.outlines.spans import breaks_of_triangles
-from rts.outlines.stacks import breaks_of_stacks
 
 
 class Beside(NamedTuple):
@@ -66,6 +65,8 @@ def breaks_of_sheets(
     """The breaks between what is seen at centres (K, H, W); of several layers, nothing behind an opaque one."""
     if len(layers.part) == 1:
         return breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, width, seams), None
+    from rts.outlines.stacks import breaks_of_stacks
+
     return breaks_of_stacks(layers, opaque, sheets, width, seams)
 
 

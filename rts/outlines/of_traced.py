@@ -32,7 +32,7 @@ from rts.sampling.side_by_side import DrawnView, joined
 def sampled_by_one_call(
     scene: Scene, grid: Grid, layers: int, told: Told, uniform: bool, capacity: int | None
 ) -> Sampled | None:
-    """The samples of a scene with their outlines, by one call to the host.
+    """The samples of a scene whose values are not at hand, with their outlines, by one call to the host.
 
     The cells of each part's samples are its rows, one after the other, −1 for those that are not in use. Samples beyond
     `capacity` in a part, and breaks beyond `most_breaks`, are dropped, and counted in `overflow`.
@@ -46,10 +46,10 @@ def sampled_by_one_call(
         capacity: as of `Request`.
 
     Returns:
-        None for values that are known, and where parts cannot be sampled along with others (`is_suited`).
+        None for values that are known after all, and where parts cannot be sampled along with others (`is_suited`).
     """
     engine = scene.context.engine
-    if scene.cameras or not (engine.differentiates and all(map(is_suited, scene.parts, scene.samplers))):
+    if not (engine.differentiates and all(map(is_suited, scene.parts, scene.samplers))):
         return None
     values = stopped(values_of(scene, grid))
     operands = [x for x in leaves(values) if type(x) is not np.ndarray]

@@ -17,7 +17,8 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.beside import Beside, breaks_of_sheets, limited
 from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import Breaks, Fronts, Gaps, Hints, Oracle, Stacks, find_breaks
+from rts.outlines.gaps import Breaks, Fronts, Gaps, Stacks
+from rts.outlines.halving import Hints, Oracle, find_breaks
 from rts.outlines.sheets import Sheets
 from rts.plugin_base import overrides
 from rts.registry import name_of

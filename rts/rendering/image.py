@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from rts.advice.empty_images import why_empty
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
@@ -274,6 +273,8 @@ def warned_if_empty(image: Array, scene: Scene, name: str = "the image") -> Arra
             return image
     elif pixels[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or pixels[..., -1].any():
         return image
+    from rts.advice.empty_images import why_empty
+
     warn(f"nothing is seen in {name}: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image
 

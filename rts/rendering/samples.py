@@ -9,13 +9,10 @@ from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
 from rts.outlines.of_joint import AtOnce
-from rts.outlines.of_scene import with_outlines
-from rts.outlines.of_traced import sampled_by_one_call
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host, real_of
 from rts.sampling.layer_count import has_full_stacks, with_all_layers
-from rts.sampling.merging import sampled_parts
 from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
@@ -85,7 +82,9 @@ def sampled_scene(
     same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
     request = Request(capacity, triangles=outlines or settings.fronts)
     sampled = None
-    if outlines and layers != "auto" and not settings.fronts:
+    if outlines and layers != "auto" and not settings.fronts and not scene.cameras:
+        from rts.outlines.of_traced import sampled_by_one_call
+
         sampled = sampled_by_one_call(scene, grid, layers, told, same, capacity)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=apron)
@@ -97,6 +96,8 @@ def sampled_scene(
     def taken(count: int) -> Sampled:
         if at_once is not None:
             return at_once.centres(count)
+        from rts.sampling.merging import sampled_parts
+
         return sampled_parts(scene, grid, request, count, 1 if outlines and capacity is None else None)
 
     least = 1
@@ -105,6 +106,8 @@ def sampled_scene(
         if at_once is not None:
             sampled = at_once.found(sampled, told if outlines else None, real_of(scene), same)
         elif outlines:
+            from rts.outlines.of_scene import with_outlines
+
             triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, told, capacity)
             sampled = sampled.replace(triangle=triangle) if settings.fronts else sampled
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):

@@ -44,7 +44,6 @@ from rts.scene.row_cameras import RowCameras
 from rts.shading.environment import blurs, prefiltered, reflected
 from rts.shading.spherical_harmonics import COUNTS, irradiance, radiance
 from rts.shading.theta_entries import check_entry
-from rts.shading.visibility import Seen, mean_visibility
 
 AMBIENT, COLOR = 0.2, 0.8
 DIRECTION = (-0.3, 0.5, 0.81)
@@ -91,8 +90,12 @@ class Light:
         Args:
             positions: (N, 3) world.
         """
-        shadows = self.shadows or [None] * (len(self.distant) + len(self.points))
-        for (direction, brightness), shadow in zip(self._unshadowed(positions), shadows, strict=True):
+        if not self.shadows:
+            yield from self._unshadowed(positions)
+            return
+        from rts.shading.visibility import mean_visibility
+
+        for (direction, brightness), shadow in zip(self._unshadowed(positions), self.shadows, strict=True):
             yield direction, brightness if shadow is None else brightness * mean_visibility(shadow, positions)
 
     def _unshadowed(self, positions: Array) -> Iterator[tuple[Array, Any]]:
@@ -206,6 +209,8 @@ def _check(name: str, value: Any) -> None:
 
 def _check_shadow(value: Any) -> None:
     """Refuse shadows that are no list of records, of lists of records, and of None."""
+    from rts.shading.visibility import Seen
+
     shadows = value if isinstance(value, (list, tuple)) else [value]
     for shadow in shadows:
         several = shadow if isinstance(shadow, (list, tuple)) and shadow else [shadow]

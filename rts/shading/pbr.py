@@ -19,12 +19,10 @@ from rts.shading import microfacets
 from rts.shading.light import light_of
 from rts.shading.shaders import Unlit, is_behind
 from rts.shading.tangents import TANGENT, tangent_frame
-from rts.shading.textures import Wrap, check_sampler, own_uv, sample_texture
+from rts.shading.textures import MAPS, Wrap, check_sampler, own_uv, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
 from rts.shading.uv_footprints import FOOTPRINT
 
-MAPS = ("metallic", "roughness", "normal_map", "occlusion", "emissive", "specular")
-"""Entries of θ that may be maps, beside the texture."""
 DIELECTRIC = 0.04
 """The reflectance of dielectrics at normal incidence."""
 

@@ -17,6 +17,8 @@ FILTERS = ("linear", "nearest")
 """Ways to read between the centres of texels."""
 TAPS = (4, 2, 1)
 """Numbers of lookups along the longer axis of a footprint."""
+MAPS = ("metallic", "roughness", "normal_map", "occlusion", "emissive", "specular")
+"""Entries of θ that may be maps, beside the texture."""
 Wrap = str | tuple[str, str]
 """A continuation, or one along u and one along v."""
 

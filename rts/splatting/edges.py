@@ -17,7 +17,6 @@ from rts.errors import InputError
 from rts.plugin_base import overrides
 from rts.splatting.cells import check_rows, nothing
 from rts.splatting.layers import composites
-from rts.splatting.normal_equations import normal_equations
 from rts.splatting.stencil import splat
 
 
@@ -91,6 +90,8 @@ class Edges(SummingSplatter):
         operands = collected(tree)
 
         def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+            from rts.splatting.normal_equations import normal_equations
+
             it = iter(arrays)
             return normal_equations(*map_leaves(lambda _: next(it), tree), border=splats.border, loss=loss)
 

@@ -5,7 +5,8 @@ import pytest
 from helpers import pushed
 
 import rts
-from rts.outlines.gaps import Fronts, Hints, Oracle, find_breaks
+from rts.outlines.gaps import Fronts
+from rts.outlines.halving import Hints, Oracle, find_breaks
 
 torch = pytest.importorskip("torch")
 
