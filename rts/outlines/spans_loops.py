@@ -362,14 +362,8 @@ def by_start(first, last, begins, starts, order):
         while step > 0:
             for n in range(begin + step, stop):
                 span, m = order[n], n
-                while m - step >= begin and _is_later(order[m - step], span, starts):
+                while m - step >= begin and (starts[order[m - step]], order[m - step]) > (starts[span], span):
                     order[m] = order[m - step]
                     m -= step
                 order[m] = span
             step //= 3
-
-
-@compiled(inline="always")
-def _is_later(i, j, starts):
-    """True if span i comes after j."""
-    return starts[i] > starts[j] or (starts[i] == starts[j] and i > j)

@@ -11,7 +11,7 @@ from rts.contracts.records import Request, Sampled
 from rts.outlines.of_joint import AtOnce
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
-from rts.sampling.host_scenes import in_engine, on_the_host, real_of
+from rts.sampling.host_scenes import in_engine, on_the_host, real_of, with_attributes
 from rts.sampling.layer_count import has_full_stacks, with_all_layers
 from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Grid, Scene
@@ -114,4 +114,4 @@ def sampled_scene(
             break
         least = 2 * sampled.row.shape[-3]
     sampled = replace(sampled, supersample=factor, apron=apron)
-    return in_engine(sampled, given) if scene.cameras and not stays else sampled
+    return in_engine(with_attributes(sampled, given), given) if scene.cameras and not stays else sampled

@@ -76,17 +76,22 @@ def real_of(scene: Scene) -> type:
     return np.float64 if like is None or floating_bits(like) == 64 else np.float32
 
 
-def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
-    """Samples that were found on the host, in arrays of the scene's engine.
+def with_attributes(sampled: Sampled, scene: Scene) -> Sampled:
+    """Samples that were found on the host, of parts whose θ is constant with the attributes that shaders read.
 
-    Of parts whose θ is constant they have the attributes that shaders read.
+    NumPy evaluates them later.
     """
+    if not scene.context.engine.differentiates:
+        return sampled
+    samples = tuple(map(_evaluated, scene.parts, sampled.samples, repeat(real_of(scene))))
+    return replace(sampled, samples=samples) if any(map(is_not, samples, sampled.samples)) else sampled
+
+
+def in_engine(sampled: Sampled, scene: Scene) -> Sampled:
+    """Samples that were found on the host, in arrays of the scene's engine."""
     engine, like = scene.context
     if not engine.differentiates:
         return sampled
-    samples = tuple(map(_evaluated, scene.parts, sampled.samples, repeat(real_of(scene))))
-    if any(map(is_not, samples, sampled.samples)):
-        sampled = replace(sampled, samples=samples)
     leaves = collected(sampled)
     arrays = dict(zip(map(id, leaves), leaves, strict=True))  # Some stand in it twice, as the cells of a single part.
     moved = dict(zip(arrays, engine.placed(list(arrays.values()), like), strict=True))

@@ -7,13 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
-from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Cells, Sampled, Samples
 from rts.outlines.of_joint import AtOnce
 from rts.rendering.settings import RenderSettings
-from rts.sampling.host_scenes import in_engine, real_of
+from rts.sampling.host_scenes import in_engine, real_of, with_attributes
 from rts.sampling.picture import Picture
 from rts.sampling.side_by_side import DrawnView, joined
 from rts.sampling.tables import in_one_table
@@ -29,18 +27,20 @@ def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: Rend
     same = not told.colors and outlines and layers == 1 and not settings.fronts
     at_once = AtOnce(joint, grid, scene.opaque if outlines else [False] * len(scene.parts))
     sampled = at_once.found(at_once.centres(layers), told if outlines else None, real_of(scene), same)
-    sampled = in_engine(sampled, scene)
-    sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
-    return _by_place(sampled, picture, [len(view.proxies) for view in views])
+    sampled, counts = _by_place(with_attributes(sampled, scene), [len(view.proxies) for view in views])
+    sampled = replace(in_engine(sampled, scene), supersample=settings.supersample, apron=settings.apron)
+    return with_counts(sampled, picture, counts)
 
 
-def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Views:
+def _by_place(sampled: Sampled, numbers: Sequence[int]) -> tuple[Sampled, tuple[np.ndarray, ...]]:
     """Samples of parts, view after view, as tables: of the first parts of all views, of the second, and so on.
 
     Args:
-        sampled: the samples, with a table for each part of each view.
-        picture: the layout of the views.
-        numbers: the number of parts of each view.
+        sampled: the samples on the host, with a table for each part of each view.
+        numbers: the number of parts of each of B views.
+
+    Returns:
+        The samples, and for each table the numbers (B,) of rows of each view.
     """
     places = np.concatenate([np.arange(n) for n in numbers])
     sizes = np.array([table.ids.shape[0] for table in sampled.samples])
@@ -56,10 +56,10 @@ def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Vie
         starts = np.empty(len(sizes), np.int64)
         starts[order] = np.cumsum(sizes[order]) - sizes[order]
         moved = np.arange(sizes.sum()) + np.repeat(starts - (np.cumsum(sizes) - sizes), sizes)
-        cells = replace(cells, row=_moved(cells.row, moved))
-        stencil = None if stencil is None else stencil.with_samples(lambda rows: _moved(rows, moved))
-    sampled = replace(sampled, samples=samples, cells=cells, stencil=stencil)
-    return with_counts(sampled, picture, tuple(counts))
+        table = np.append(moved, -1).astype(np.int32)  # −1 takes the last.
+        cells = replace(cells, row=table[cells.row])
+        stencil = None if stencil is None else stencil.with_samples(table.__getitem__)
+    return replace(sampled, samples=samples, cells=cells, stencil=stencil), tuple(counts)
 
 
 def _in_one_table(samples: Sequence[Samples]) -> Samples:
@@ -68,12 +68,4 @@ def _in_one_table(samples: Sequence[Samples]) -> Samples:
     if len(names) > 1:
         samples = [replace(table, gbuffer=None) for table in samples]
     whole = in_one_table(samples)
-    row = np.arange(whole.ids.shape[0], dtype=np.int32)[None, None]
-    return replace(whole, cells=Cells(engine_of(whole.ids).constant(row, whole.ids)))
-
-
-def _moved(rows: Array, moved: np.ndarray) -> Array:
-    """Indices of rows that have `moved`; −1 stays."""
-    xp, table = namespace(rows), engine_of(rows).constant(moved.astype(np.int32), rows)
-    found = xp.reshape(xp.take(table, xp.reshape(xp.clip(rows, 0), (-1,)), axis=0), rows.shape)
-    return xp.where(rows >= 0, found, rows)
+    return replace(whole, cells=Cells(np.arange(whole.ids.shape[0], dtype=np.int32)[None, None]))

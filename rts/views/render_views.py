@@ -22,7 +22,7 @@ from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
-from rts.sampling.host_scenes import in_engine
+from rts.sampling.host_scenes import in_engine, with_attributes
 from rts.sampling.picture import Picture, at_once
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import DrawnView
@@ -213,7 +213,7 @@ def _sampled(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSet
 def _in_engine(views: Views, scene: Scene) -> Views:
     """Views of a scene with samples in arrays of its engine, wherever they were found."""
     on_host = type(views.sampled.row) is np.ndarray
-    return views._replace(sampled=in_engine(views.sampled, scene)) if on_host else views
+    return views._replace(sampled=in_engine(with_attributes(views.sampled, scene), scene)) if on_host else views
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
