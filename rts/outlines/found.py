@@ -33,10 +33,9 @@ class Outlines(NamedTuple):
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
         place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
-        near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
-            surfaces pass through one another; at seams 0, where a surface goes on and its colours may change. Of
-            several layers it is about the one that ends there.
-        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
+        near: (B,) int32, `edge_kinds.BEFORE_ENDS`, BEHIND_ENDS or CROSS; BEFORE_ENDS at seams, where a surface goes on
+            and its colours may change. Of several layers it is about the one that ends there.
+        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is CROSS; else 0.
         ends: (B, 2) bool: is this the gap's first break, and its last?
         square: (S, 2) int32, the first corner (y, x) of each segment's square.
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.gaps import SEAM
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS, SEAM
 from rts.outlines.spans_loops import TINY
 
 LAST = 4e-5
@@ -183,7 +183,7 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
 
 @compiled(inline="always")
 def _kind(before, behind, nearer, stops, starts):
-    """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; −1, not at all.
+    """How a front changes at a place: BEFORE_ENDS, BEHIND_ENDS or CROSS; −1, not at all.
 
     Where two parts meet at an edge of both, the kind is SEAM.
 
@@ -197,13 +197,13 @@ def _kind(before, behind, nearer, stops, starts):
     kind = -1
     if before < 0 or behind < 0:
         if before != behind:
-            kind = 1 if before < 0 else 0
+            kind = BEHIND_ENDS if before < 0 else BEFORE_ENDS
     elif nearer >= 0:
         kind = nearer
     elif stops != starts:
-        kind = 0 if stops else 1
+        kind = BEFORE_ENDS if stops else BEHIND_ENDS
     elif not stops:
-        kind = 2
+        kind = CROSS
     elif before != behind:
         kind = SEAM
     return kind
@@ -224,24 +224,9 @@ def is_seam(x, y, first_kind, second_kind, spans):
 
 @loop
 def breaks(
-    first,
-    last,
-    gap,
-    begins,
-    spans,
-    names,
-    parts,
-    seen,
-    triangle,
-    depth,
-    ends,
-    end_depth,
-    inner,
-    rows,
-    counts,
-    whole,
+    first, last, gap, begins, spans, names, parts, seen, triangle, depth, ends, end_depth, inner, rows, counts, whole,
     numbers,
-):
+):  # fmt: skip
     """Fill in the breaks along gaps, in order.
 
     The helpers take these arrays whole, with a gap's number and range of spans: a view of an array costs as much as a

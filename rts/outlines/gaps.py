@@ -70,18 +70,13 @@ class Gaps(NamedTuple):
         return cls(gap, rows, columns, cells)
 
 
-SEAM = 3
-"""`Breaks.near` where a surface goes on across edges that its triangles do not share, so that colours may change; and
-where two parts meet at an edge of both."""
-
-
 class Breaks(NamedTuple):
     """Breaks, those of a gap in order along it. Host arrays; see `rts.outlines.found.Outlines`.
 
     Attributes:
         gap: (B, 3) int32.
         place: (B, 2) float64.
-        near: (B,) int32; or SEAM.
+        near: (B,) int32; see `edge_kinds`.
         slope: (B, 2, 2) float64.
         ends: (B, 2) bool.
         points: (B, 2, 2) float64, x and y of the last samples before and behind each break.

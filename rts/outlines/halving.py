@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
 from rts.outlines.gaps import INNER, Breaks, Fronts, Stacks
 
 FINE = 1e-4
@@ -131,7 +132,7 @@ def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> t
         change.parts(near),
         joined,
         np.full((len(number), 4), -1, np.int32),
-        np.where((near == 2)[:, None], lines_of_crossing(slope), _directions(found, gap[number], gaps, oracle)),
+        np.where((near == CROSS)[:, None], lines_of_crossing(slope), _directions(found, gap[number], gaps, oracle)),
         cells_away(change.depth(near), oracle.width),
     )
     return breaks, change.stacks(near, points, beside)
@@ -365,17 +366,17 @@ class _Change(NamedTuple):
 
     def moves(self, near: np.ndarray) -> list[np.ndarray]:
         """For each side the layer (B,) that moves the break if the other does not; those that cross if `near` is 2."""
-        return [np.where(near == 2, self.first, at) for at in self.ends]
+        return [np.where(near == CROSS, self.first, at) for at in self.ends]
 
     def parts(self, near: np.ndarray) -> np.ndarray:
         """(B, 2) int32, the part that moves the break and what is seen behind it, or those that cross, by sides."""
-        at = np.where(near == 2, self.first, np.where(near == 1, self.ends[1], self.ends[0]))
+        at = np.where(near == CROSS, self.first, np.where(near == BEHIND_ENDS, self.ends[1], self.ends[0]))
         return np.stack([side.of_layer(at).part for side in self.sides], 1)
 
     def depth(self, near: np.ndarray) -> np.ndarray:
         """(B,) the depth of the surface that ends, or of one that crosses another."""
         depths = [side.of_layer(at).depth for side, at in zip(self.sides, self.moves(near), strict=True)]
-        return np.where(near == 1, depths[1], depths[0])
+        return np.where(near == BEHIND_ENDS, depths[1], depths[0])
 
     def classified(self, found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[np.ndarray, np.ndarray]:
         """`near` (B,) and `slope` (B, 2, 2) of breaks."""
@@ -387,7 +388,7 @@ class _Change(NamedTuple):
             slopes = _sampled_slopes(found.at(meets), self.first[meets], gaps, oracle)
             turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
             there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
-            near[meets[there]], slope[meets[there]] = 2, slopes[there]
+            near[meets[there]], slope[meets[there]] = CROSS, slopes[there]
         return near, slope
 
     def stacks(self, near: np.ndarray, points: np.ndarray, inner: np.ndarray) -> Stacks:
@@ -408,7 +409,7 @@ class _Change(NamedTuple):
         numbers = [_numbers(side.part) for side in self.sides]
         moves = np.stack([np.take_along_axis(n, m[None], 0)[0] for n, m in zip(numbers, self.moves(near), strict=True)])
         numbers = np.concatenate([moves, np.take_along_axis(np.concatenate(numbers), order, 0)])
-        last = np.where((near[:, None] == 2) | (near[:, None] == [0, 1]), self.parts(near), -1)
+        last = np.where((near[:, None] == CROSS) | (near[:, None] == [BEFORE_ENDS, BEHIND_ENDS]), self.parts(near), -1)
         part = np.take_along_axis(part, order, 0)
         at = np.take_along_axis(at, order[..., None], 0)
         return Stacks(last, part.T, np.full(part.T.shape, -1), at.transpose(1, 0, 2), sides, numbers.T)

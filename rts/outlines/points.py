@@ -16,6 +16,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.beside import Beside, breaks_of_sheets, limited
+from rts.outlines.edge_kinds import BEHIND_ENDS, CROSS
 from rts.outlines.found import Outlines, Told
 from rts.outlines.gaps import Breaks, Fronts, Gaps, Stacks
 from rts.outlines.halving import Hints, Oracle, find_breaks
@@ -88,7 +89,8 @@ class Points:
 
         They are added to the samples of parts.
         """
-        part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
+        part = np.where(breaks.near == BEHIND_ENDS, breaks.parts[:, 1], breaks.parts[:, 0])
+        part[breaks.near == CROSS] = -1
         rows = np.full((len(part), 2), -1, np.int32)
         if not self._told.motions:
             part[:] = -1

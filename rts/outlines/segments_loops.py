@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.gaps import SEAM
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS, SEAM
 
 LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
 """Costs, in cells, beside the length of segments: a break that stays alone; a segment between two breaks on one side,
@@ -56,7 +56,7 @@ def places(gap, at, near, place, kind):
     """Fill in `Outlines.place` (B,) and `Outlines.near` (B,), from the fields of `Breaks`."""
     for b in range(len(gap)):
         place[b] = at[b, 0] - gap[b, 1] - 0.5 if gap[b, 2] == 1 else at[b, 1] - gap[b, 0] - 0.5
-        kind[b] = 0 if near[b] == SEAM else near[b]  # There both surfaces move alike.
+        kind[b] = BEFORE_ENDS if near[b] == SEAM else near[b]  # There both surfaces move alike.
 
 
 @loop
@@ -86,7 +86,7 @@ def ends_of(gap, place, near, parts, height, width):
         at = place[b, 0] - x - 0.5 if row == 1 else place[b, 1] - y - 0.5
         at = min(max(at, 0.0), 1 - 1e-9)
         front, back = parts[b, 0], parts[b, 1]
-        if near[b] == 1 or (near[b] == 2 and front > back):
+        if near[b] == BEHIND_ENDS or (near[b] == CROSS and front > back):
             front, back = back, front
         if near[b] == SEAM:
             front = -2 - min(front, back) * most - max(front, back)
@@ -101,7 +101,7 @@ def ends_of(gap, place, near, parts, height, width):
                 continue
             square[count] = top * width + left
             along[count] = on_sides(at, at, side)
-            sign = 0 if near[b] >= 2 else (1 if near[b] == 0 else -1)
+            sign = 0 if near[b] >= CROSS else (1 if near[b] == BEFORE_ENDS else -1)
             ends[count, 0], ends[count, 1], ends[count, 2] = b, side, sign if side < 2 else -sign
             ends[count, 3], ends[count, 4] = front, back
             count += 1
@@ -301,9 +301,9 @@ def ending(near, parts, triangles):
     """(B,) int64: the triangle that ends at each break, of all parts no two alike, or −1."""
     most, found = np.int64(-1), np.empty(len(near), np.int64)
     for b in range(len(near)):
-        most = max(most, np.int64(triangles[b, 1 if near[b] == 1 else 0]))
+        most = max(most, np.int64(triangles[b, 1 if near[b] == BEHIND_ENDS else 0]))
     for b in range(len(near)):
-        side = 1 if near[b] == 1 else 0
+        side = 1 if near[b] == BEHIND_ENDS else 0
         t = triangles[b, side]
         found[b] = t + parts[b, side] * (1 + most) if t >= 0 else -1
     return found

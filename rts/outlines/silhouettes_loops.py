@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
 from rts.outlines.sheets_loops import on_edges, plane_at
 from rts.sampling.points_loops import corners_of, edge
 
@@ -183,7 +184,7 @@ def edges(first, last, near, parts, triangles, points, own, rows, vertices, face
     Args:
         first: the first break.
         last: the break after the last.
-        near: (B,), 2 where surfaces cross, 1 where the one behind a break ends there, else 0.
+        near: (B,), see `edge_kinds.BEFORE_ENDS`.
         parts: (B, 2), the parts before and behind.
         triangles: (B, 2 or more), alike.
         points: (B, 2), where breaks are.
@@ -199,11 +200,11 @@ def edges(first, last, near, parts, triangles, points, own, rows, vertices, face
     for b in range(first, last):
         x, y = points[b, 0], points[b, 1]
         for side in range(2):
-            ends = side == (1 if near[b] == 1 else 0)
-            if not (own[0] <= parts[b, side] < own[1] and (ends or near[b] == 2)):
+            ends = side == (1 if near[b] == BEHIND_ENDS else 0)
+            if not (own[0] <= parts[b, side] < own[1] and (ends or near[b] == CROSS)):
                 continue
             sign = corners_of(triangles[b, side], rows, vertices, faces, corners)
-            if near[b] == 2:
+            if near[b] == CROSS:
                 # Not a number where a triangle is seen edge-on.
                 depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
             else:
@@ -231,20 +232,20 @@ def settle(width, depth, near, slope, tangent, away):
     Args:
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         depth: (B,), see `edges`.
-        near: (B,), see `edges`; becomes 0 where slopes of surfaces that cross hardly differ.
+        near: (B,), see `edges`; becomes BEFORE_ENDS where slopes of surfaces that cross hardly differ.
         slope: (B, 2, 2), see `edges`; becomes 0 but at crossings.
         tangent: (B, 2), see `edges`.
         away: (B,) to fill with `Breaks.cells_away`.
     """
     for b in range(len(near)):
         away[b] = np.log(width[0] + width[1] * depth[b]) / width[1] if width[1] > 0 else depth[b] / width[0]
-        if near[b] == 2:
+        if near[b] == CROSS:
             x, y = slope[b, 1, 0] - slope[b, 0, 0], slope[b, 1, 1] - slope[b, 0, 1]
             if abs(x) + abs(y) > 1e-4 * (width[0] + width[1] * depth[b]):
                 tangent[b, 0], tangent[b, 1] = y, -x
             else:
-                near[b] = 0
-        if near[b] != 2:
+                near[b] = BEFORE_ENDS
+        if near[b] != CROSS:
             slope[b] = 0.0
         length = np.hypot(tangent[b, 0], tangent[b, 1])
         if length > 0:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
 from rts.outlines.fronts_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at, is_seam
 from rts.outlines.spans_loops import TINY
 
@@ -233,7 +234,7 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
 
     `enders[f]` are filled with the runs that change, the second one −1 for none.
     """
-    e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == 2 else partner
+    e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == CROSS else partner
     enders[f, 0], enders[f, 1] = stack[at], stack[second] if second >= 0 else -1
     whole[e, 1], place_of[e] = kind, place
     samples[e], sides[e] = -1, -1
@@ -246,13 +247,14 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
         samples[e, 2 + n, 0], samples[e, 2 + n, 1] = of[i, PART], of[i, TRIANGLE]
         places[e, 2 + n] = min(max(place, own[i, 0]), own[i, 1])
         n += 1
-        if of[i, OPAQUE] == 1 and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
+        ends = kind < CROSS and (m == at or m == partner)
+        if of[i, OPAQUE] == 1 and not ends and m > (at if kind == CROSS else -1):
             break
     for side in range(2):
         k, whole[e, 2 + side] = 0, -1
         for m in range(n):
             here = m
-            if kind == 2 and side == 1 and (m == at or m == at + 1) and at + 1 < n:
+            if kind == CROSS and side == 1 and (m == at or m == at + 1) and at + 1 < n:
                 here = 2 * at + 1 - m
             if kind == 1 - side and (m == at or m == partner):
                 continue
@@ -263,7 +265,7 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
             if of[stack[here], OPAQUE] == 1:
                 break
     # The surface that changes, and what is behind it: parts before and behind the break.
-    if kind == 2:
+    if kind == CROSS:
         whole[e, 2], whole[e, 3] = of[stack[at], PART], of[stack[at + 1], PART]
     else:
         whole[e, 2 + kind] = of[stack[at], PART]
@@ -279,13 +281,13 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
     place = place_of[e]
     for n in range(2):
         i = enders[f, n]
-        if kind == 2:
+        if kind == CROSS:
             samples[e, n, 0], samples[e, n, 1], places[e, n] = of[i, PART], of[i, TRIANGLE], place
             continue
         if i < 0:
             continue
         x = i
-        if kind == 0:
+        if kind == BEFORE_ENDS:
             end = min(max(place - LAST, own[x, 0], 0.0), place)
             beside = place_of[e - 1] if f > 0 else 0.0
             inward = end - min(inner, max(end - beside, 0.0) / 2)
@@ -361,7 +363,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             place = max(place, there)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, 2, m, -1, place
+                    change = base, found, CROSS, m, -1, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             stack[m], stack[m + 1] = stack[m + 1], stack[m]
@@ -375,7 +377,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             m, partner = (partner, m) if 0 <= partner < m else (m, partner)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, 0, m, partner, place
+                    change = base, found, BEFORE_ENDS, m, partner, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             for x in (partner, m):
@@ -396,7 +398,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                 m, partner = (m, partner) if partner > m else (partner, m + 1)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, 1, m, partner, place
+                    change = base, found, BEHIND_ENDS, m, partner, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             i = _next_starting(n, own, of, place, farther)
@@ -427,7 +429,7 @@ def changes(
         rows: (M,) int64 to fill: the row where the changes of each gap begin; −1 where there is too little room.
         counts: (M,) int32 to fill: the number of changes of each gap.
         inner: distance of the samples that tell colours of what ends.
-        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
+        whole: (E, 6) int32 to fill: gap; BEFORE_ENDS, BEHIND_ENDS or CROSS; the part of the surface that changes,
             and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
         samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then

@@ -9,6 +9,7 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel, read_only
 from rts.outlines.areas_loops import add_squares
+from rts.outlines.edge_kinds import CROSS
 
 BANDS, SEGMENTS = 8, 400
 """The most bands of lines whose entries are made at once, and the fewest segments of each. These are numbers of their
@@ -219,7 +220,7 @@ def _of_breaks(near, slope, rows, inner, pair, stack, cells):
             for i in range(2):
                 moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
             continue
-        if near[b] < 2:
+        if near[b] < CROSS:
             moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
             continue
         square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
