@@ -121,7 +121,7 @@ def _odd(first, stop, order, ends, e):
 
 @loop
 def turn_clockwise(order, group, along):
-    """Sort, in `order` (E,) int64, which has ends by groups (E,), those of each group by `along` (E,)."""
+    """Sort the ends of each group by `along` (E,): `order` (E,) int64 lists ends sorted by `group` (E,)."""
     begin = 0
     for n in range(len(order)):
         end, m = order[n], n

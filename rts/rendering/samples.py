@@ -70,7 +70,7 @@ def sampled_scene(
 
     With `one_shader` they serve the shaders of the scene and derivatives in its values alone, so that cells of one
     colour may name one sample, and samples beside outlines need not tell motions of what is constant. With `stays`,
-    samples that were found on the host are not moved into the scene's engine; see `in_engine`.
+    samples that were found on the host stay there as they are, without `with_attributes` and `in_engine`.
     """
     factor, capacity = settings.supersample, settings.capacity
     apron, outlines = settings.apron, settings.finds_outlines

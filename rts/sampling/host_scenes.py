@@ -77,9 +77,9 @@ def real_of(scene: Scene) -> type:
 
 
 def with_attributes(sampled: Sampled, scene: Scene) -> Sampled:
-    """Samples that were found on the host, of parts whose θ is constant with the attributes that shaders read.
+    """Samples that were found on the host; those of parts with constant θ get the attributes that shaders read.
 
-    NumPy evaluates them later.
+    A scene of NumPy is left as it is: its attributes are evaluated when it is shaded.
     """
     if not scene.context.engine.differentiates:
         return sampled

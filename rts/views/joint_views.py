@@ -56,7 +56,7 @@ def _by_place(sampled: Sampled, numbers: Sequence[int]) -> tuple[Sampled, tuple[
         starts = np.empty(len(sizes), np.int64)
         starts[order] = np.cumsum(sizes[order]) - sizes[order]
         moved = np.arange(sizes.sum()) + np.repeat(starts - (np.cumsum(sizes) - sizes), sizes)
-        table = np.append(moved, -1).astype(np.int32)  # −1 takes the last.
+        table = np.append(moved, -1).astype(np.int32)  # The index −1 reads the last one, −1.
         cells = replace(cells, row=table[cells.row])
         stencil = None if stencil is None else stencil.with_samples(table.__getitem__)
     return replace(sampled, samples=samples, cells=cells, stencil=stencil), tuple(counts)

@@ -211,7 +211,7 @@ def _sampled(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSet
 
 
 def _in_engine(views: Views, scene: Scene) -> Views:
-    """Views of a scene with samples in arrays of its engine, wherever they were found."""
+    """Views of a scene in arrays of its engine, with attributes of constant parts, wherever samples were found."""
     on_host = type(views.sampled.row) is np.ndarray
     return views._replace(sampled=in_engine(with_attributes(views.sampled, scene), scene)) if on_host else views
 

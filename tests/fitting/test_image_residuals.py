@@ -13,7 +13,7 @@ from rts.errors import InputError
 from rts.fitting import image_residuals
 from rts.fitting.normal_equations import normal_equations
 from rts.rendering import settings
-from rts.splatting import edges
+from rts.splatting import normal_equations as sweep
 
 pytestmark = pytest.mark.fitting
 
@@ -77,13 +77,13 @@ def fields(channels, seed=1):
 
 def count_sweeps(monkeypatch):
     calls = []
-    whole = edges.normal_equations
+    whole = sweep.normal_equations
 
     def counted(*args, **options):
         calls.append(args)
         return whole(*args, **options)
 
-    monkeypatch.setattr(edges, "normal_equations", counted)
+    monkeypatch.setattr(sweep, "normal_equations", counted)
     return calls
 
 

@@ -148,7 +148,7 @@ def test_nan_that_no_sample_sees_hurts_nobody():
 COLORS = "colours", "texture", "colour", "colour of light", "ambient light", "specular"
 
 
-@pytest.mark.filterwarnings("ignore:.*goes up to")  # Of a texture, where the surface is seen for the first time.
+@pytest.mark.filterwarnings("ignore:.*goes up to")  # Of a texture, once for each surface.
 @pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
 @pytest.mark.parametrize("what", COLORS)
 def test_colours_too_bright_for_their_derivatives_are_refused_by_name(what, target):
