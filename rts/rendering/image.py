@@ -59,7 +59,7 @@ def render(
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of layers × cells.
             Samples beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them.
             If the image is rendered in bands, each band has this capacity. For the splatter "edges" there is also room
-            for breaks of outlines: 8 a row and a column of the grid, or `capacity` / 4 if that is more. Those beyond
+            for edge crossings: 8 a row and a column of the grid, or `capacity` / 4 if that is more. Those beyond
             come with a warning: pass more where there are many edges.
         engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
             holds a network. None for the engine of the arrays.
@@ -93,7 +93,7 @@ def render(
     Warns:
         EmptyImageWarning: nothing is seen; the warning says why.
         AspectWarning: the camera is for images of another ratio of width to height.
-        InputWarning: samples, or breaks of outlines, find no room in `capacity`; nothing reads an entry of θ; a
+        InputWarning: samples, or edge crossings, find no room in `capacity`; nothing reads an entry of θ; a
             culled part is wound inside out; a sampler cannot sample single points, so that outlines lie midway between
             centres; vertices of prepared parts have changed; coordinates are too large for float32.
         LayersWarning: surfaces or light behind the last layer are left out.

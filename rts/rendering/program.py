@@ -18,9 +18,9 @@ def program(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
     """A function like `f` that runs as one program, which the engine of its arguments compiles at the first call.
 
     For a GPU, where torch otherwise launches hundreds of small operators one by one. Call `rts.sample` before, and pass
-    what it gives: numbers of samples and of breaks may change from call to call. So may values of arguments, which have
+    what it gives: numbers of samples and of edge crossings may change from call to call. So may values of arguments, which have
     their derivatives. For other shapes, dtypes or settings a further program is compiled; by torch also where there is
-    no sample or break, or one. Arrays that `f` closes over are those of the first call.
+    no sample or crossing, or one. Arrays that `f` closes over are those of the first call.
 
     torch compiles for a minute or two, jax for seconds. By NumPy `f` runs as it is.
 
@@ -52,7 +52,7 @@ def program(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
 
 
 def _varying(tree: Tree) -> Tree:
-    """A tree with, for each array, the axis whose length may vary: the number of samples, or of breaks. −1 for none.
+    """A tree with, for each array, the axis whose length may vary: the number of samples, or of crossings. −1 for none.
 
     Arrays of the result of `rts.sample` have one, but for those (·, H, W) of its cells.
     """
@@ -68,7 +68,7 @@ def _varying(tree: Tree) -> Tree:
 
 
 def _axis_of_samples(shape: tuple[int, ...], cells: tuple[int, ...]) -> int:
-    """The axis of samples, or of breaks, of an array of this shape; −1 for one of `cells` (H, W)."""
+    """The axis of samples, or of crossings, of an array of this shape; −1 for one of `cells` (H, W)."""
     if not shape or shape[-2:] == cells:
         return -1
     # Of several parts each has the cells that it is seen in, (·, 1, M).

@@ -25,7 +25,7 @@ APRON = 2
 
 OUTLINES_APRON = 1
 """How many more are sampled where outlines are found: how an outline turns within the squares of the outermost cells is
-told by the two breaks that come next along it, the second of which is two squares farther out. So a window, or a view
+told by the two crossings that come next along it, the second of which is two cells farther out. So a window, or a view
 beside others, shows of them what the whole image does."""
 
 
