@@ -242,8 +242,9 @@ def _normal(t, sign, vertices, faces):
 
 @compiled(inline="always")
 def _is_open(beyond, t, edge):
-    """1 if an edge of a triangle has no other triangle beyond it; 0 for what is no edge, but a plane."""
-    return 1 if 0 <= edge < 3 and beyond[t, edge] < 0 else 0
+    """True if an edge of a triangle has no other triangle beyond it; False for what is no edge, but a plane."""
+    # Without branches: no processor could tell which edges bound a span.
+    return (edge >= 0) & (edge < 3) & (beyond[t, min(max(edge, 0), 2)] < 0)
 
 
 @compiled(inline="always")
