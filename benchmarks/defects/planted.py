@@ -158,10 +158,10 @@ LOOPS = [
         "sheets edges",
     ),
     Defect(
-        "a triangle of two cells does not count as large",
+        "triangles count as four times smaller than they are",
         "rts/outlines/silhouettes_loops.py",
-        "middling & (wide <= WIDTHS[1])",
-        "middling & (wide <= 4)",
+        "min(wide + np.float32(1.52)",
+        "min(wide / 4 + np.float32(1.52)",
         "sheets edges_soups",
     ),
     Defect(

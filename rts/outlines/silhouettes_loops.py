@@ -12,19 +12,16 @@ from rts.sampling.points_loops import corners_of, edge
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""
 
-SMALL, MIDDLING, LARGE = 1, 2, 3
-"""Sizes of triangles: at most `WIDTHS` cells wide and high, or larger, or seen in part."""
-
-WIDTHS = 0.48, 1.48
-"""Widths, in cells: all vertices of a triangle that meets a gap are in the gap's two cells, or in these and those
-beside."""
+LARGE = 6
+"""The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
+n − 0.52 cells wide and high: where they meet a gap, their vertices are at most n − 1 cells away from its two cells."""
 
 
 @loop
 def turns(first, last, rows, vertices, faces, seen, sides):
     """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
 
-    They are multiplied by the triangle's size, such as `SMALL`.
+    They are multiplied by the triangle's size; see `LARGE`.
 
     Args:
         first: the first triangle.
@@ -44,12 +41,15 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         whole = not np.isnan(area)
         if area == 0 or not whole:
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        small, middling = whole, whole
-        for axis in range(2):
-            wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
-            small, middling = small & (wide <= WIDTHS[0]), middling & (wide <= WIDTHS[1])
-        size = SMALL if small else (MIDDLING if middling else LARGE)
-        sides[t] = size if area > 0 else (-size if area < 0 else 0)
+        wide = max(_extent(a, b, c, seen, 0), _extent(a, b, c, seen, 1))
+        size = int(min(wide + np.float32(1.52), np.float32(LARGE))) if whole else LARGE
+        sides[t] = size * ((area > 0) - (area < 0))
+
+
+@compiled(inline="always")
+def _extent(a, b, c, seen, axis):
+    """How long a triangle is along an axis of the image."""
+    return max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
 
 
 @loop

@@ -9,11 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.silhouettes_loops import MIDDLING, SMALL
+from rts.outlines.silhouettes_loops import LARGE as ANYWHERE
 from rts.sampling.points_loops import corners_of, edge
 
 TINY = 1e-9
 """Shortest length of a span."""
+
+REACHES = 0, 1, 2, 4
+"""How many cells away from gaps there are marks for triangles; see `around`."""
 
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
@@ -52,18 +55,28 @@ def wanted(first, last, part, joined, met, gaps, same):
 def around(gap, cells):
     """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around.
 
-    The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside. A
-    triangle that meets a gap has all its vertices in cells that are marked so, by its size: see `WIDTHS`.
+    The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside,
+    and so on, for each of the `REACHES`. A triangle that meets a gap has all its vertices in cells that are marked so,
+    by its size; see `silhouettes_loops.LARGE`.
     """
-    height, width = cells.shape
+    width, count, marked = cells.shape[1], cells.size, cells.reshape(-1)
+    room = width * REACHES[-1]
+    marks, wider = np.zeros(count + 2 * room, np.int8), np.zeros(count + 2 * room, np.int8)
     for n in range(len(gap)):
-        y, x, row = gap[n, 0], gap[n, 1], gap[n, 2]
-        kind = 2 - row
-        for j in range(max(y - 1, 0), min(y + 2 - row, height - 1) + 1):
-            for i in range(max(x - 1, 0), min(x + 1 + row, width - 1) + 1):
-                cells[j, i] |= 4 * kind
-        cells[y, x] |= kind
-        cells[y + 1 - row, x + row] |= kind
+        kind, at = 2 - gap[n, 2], room + gap[n, 0] * width + gap[n, 1]
+        marks[at] |= kind
+        marks[at + (1 if kind == 1 else width)] |= kind
+    for n in range(len(REACHES)):
+        for axis in range(2 if n > 0 else 0):
+            # Past the end of a row they reach into the next one, which does no harm.
+            step = (REACHES[n] - REACHES[n - 1]) * (1 if axis == 0 else width)
+            before, own, behind, out = marks[room - step :], marks[room:], marks[room + step :], wider[room:]
+            for i in range(count):
+                out[i] = before[i] | own[i] | behind[i]
+            marks, wider = wider, marks
+        own = marks[room:]
+        for i in range(count):
+            marked[i] |= own[i] << 2 * n
 
 
 @loop
@@ -107,11 +120,14 @@ def _range(low, high, count):
 
 @loop
 def close(first, last, seen, cells, marks):
-    """Fill `marks` (V,) int8 with those of the cells (H, W) of vertices; beyond the border, of the nearest cell."""
+    """Fill `marks` (V,) int8 with those of the cells (H, W) of vertices; beyond the border, of the nearest cell.
+
+    Vertices behind the camera have all marks.
+    """
     height, width = cells.shape
     for v in range(first, last):
         x, y = seen[v, 0], seen[v, 1]
-        marks[v] = 0
+        marks[v] = -1
         if not np.isnan(x):
             marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
 
@@ -145,11 +161,12 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
     box = np.empty(4, np.float32)
     for t in range(first, last):
         most[t] = 0
-        if sides[t] * keep[t] < 0:
+        size = abs(sides[t])
+        if size == 0 or sides[t] * keep[t] < 0:
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        size, axes = abs(sides[t]), close[a] & close[b] & close[c]
-        axes = axes & 3 if size == SMALL else (axes >> 2 if size == MIDDLING else 3)
+        # Sizes 4 and 5 share the last of the marks.
+        axes = (close[a] & close[b] & close[c]) >> 2 * (min(size, 4) - 1) & 3 if size < ANYWHERE else 3
         if axes == 0:
             continue
         _box(a, b, c, seen, len(by_row), len(by_column), box)
@@ -242,8 +259,9 @@ def _normal(t, sign, vertices, faces):
 
 @compiled(inline="always")
 def _is_open(beyond, t, edge):
-    """1 if an edge of a triangle has no other triangle beyond it; 0 for what is no edge, but a plane."""
-    return 1 if 0 <= edge < 3 and beyond[t, edge] < 0 else 0
+    """True if an edge of a triangle has no other triangle beyond it; False for what is no edge, but a plane."""
+    # Without branches: no processor could tell which edges bound a span.
+    return (edge >= 0) & (edge < 3) & (beyond[t, min(max(edge, 0), 2)] < 0)
 
 
 @compiled(inline="always")

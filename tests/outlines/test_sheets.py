@@ -96,7 +96,7 @@ def test_silhouettes_do_not_depend_on_which_vertices_are_shared(parts):
         np.testing.assert_allclose(split, shared, atol=1e-6 * np.abs(shared).max())
 
 
-@pytest.mark.parametrize(("wide", "side"), [(0.4, 1), (0.9, 2), (1.6, 3), (9.0, 3)])
+@pytest.mark.parametrize(("wide", "side"), [(0.4, 1), (0.9, 2), (1.6, 3), (4.4, 5), (4.6, 6), (9.0, 6)])
 def test_triangles_are_told_apart_by_their_size(wide, side):
     """By the size of the number; its sign tells clockwise from counterclockwise."""
     corners = [(2, 2), (2 + wide, 2), (2, 2.4)]
@@ -153,12 +153,12 @@ def test_a_span_is_the_chord_of_a_triangle(wide, faces):
 
 
 def test_cells_around_a_gap_are_marked():
-    cells = np.zeros((5, 6), np.int8)
-    spans_loops.around(np.array([(2, 2, 1)], np.int32), cells)
-    expected = np.zeros((5, 6), np.int8)
-    expected[1:4, 1:5] = 4
-    expected[2, 2:4] = 5
-    np.testing.assert_array_equal(cells, expected)
+    cells = np.zeros((11, 12), np.int8)
+    spans_loops.around(np.array([(5, 5, 1)], np.int32), cells)
+    expected = np.zeros((11, 12), np.uint8)
+    for size, away in enumerate((0, 1, 2, 4)):
+        expected[5 - away : 6 + away, 5 - away : 7 + away] |= 1 << 2 * size
+    np.testing.assert_array_equal(cells.view(np.uint8), expected)
 
 
 def test_sheets_join_the_centres_between_which_they_go_on():

@@ -10,6 +10,7 @@ from helpers import pushed, quick
 import rts
 from rts.contracts.records import Proxy
 from rts.outlines.sheets import Sheets
+from rts.outlines.silhouettes_loops import LARGE
 
 pytestmark = pytest.mark.splatting
 
@@ -45,7 +46,7 @@ def test_triangles_that_reach_behind_the_camera_are_large(turn):
     """One triangle of the first wall has one corner ahead, and the other has two."""
     faces = WALLS[:, list(turn)].astype(np.int32)
     sides = Sheets.of(Proxy(CORNERS, faces), CAMERA, SIZE, "none").sides
-    np.testing.assert_array_equal(np.abs(sides[:4]), 3)
+    np.testing.assert_array_equal(np.abs(sides[:4]), LARGE)
 
 
 def floor(shift):
