@@ -53,14 +53,12 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
     """
     sign, start = 1.0 if side < 2 else -1.0, on_sides(ray[0][0], ray[0][1], side)
     for k in range(4):
-        east = 2.5 if k == 0 or k == 3 else 2.0
-        weight[n, k] = 0.5 * max(east + 0.5 - max(start, east), 0.0) - (0.25 if side < k else 0.0)
+        low = 2.5 if k == 0 or k == 3 else 2.0
+        weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
         length[n, k] = 0.0
-    for p in range(2):
+    for p in range(1 if ray[1] == ray[2] else 2):
         (x, y), (wx, wy) = (ray[0], ray[1]) if p == 0 else (ray[1], ray[2])
         wx, wy = wx - x, wy - y
-        if wx == 0 and wy == 0:  # The ray of a segment that meets no other ends in its corner.
-            continue
         a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
         b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
         end = 0.0
@@ -107,7 +105,7 @@ def _path(s, place, gap, square, ties, corner):
 
 @compiled(inline="always")
 def _meets(path, of_hub):
-    """Where the path of a segment meets that of its hub: as `_fill_rates` takes it."""
+    """Where on a half of its hub's path one ends, the number of the rate of this half's end, and where on its chord."""
     first, near = _along(of_hub[0], of_hub[1], path[1])
     second, far = _along(of_hub[2], of_hub[1], path[1])
     share, _ = _along(path[0], path[2], path[1])
@@ -118,17 +116,8 @@ def _meets(path, of_hub):
 def _fill_rates(rates, s, h, e, t, own, share, pull):
     """Fill the rates (2, 2, 4) of the ray from an end e of row h, to the corner of segment s; see `_weigh_ray`.
 
-    The ray runs along the segment s from where it meets that, and moves as that.
-
-    Args:
-        rates: to fill.
-        s: the segment that the ray ends at.
-        h: the ray's own.
-        e: its end.
-        t: where on a half of s they meet, 0 to 1.
-        own: which of the four breaks of s moves the end of this half: 0 or 3; if s is h, 1 + e.
-        share: where on the chord of h they meet, 0 to 1.
-        pull: (S, 4).
+    The ray runs along the segment s from where it meets that, and moves as that; t, own and share are of `_meets`, and
+    have no effect if s is h.
     """
     for r in range(4):
         rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
@@ -309,15 +298,15 @@ def _add_areas(
 
 
 @compiled(inline="always")
-def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
-    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
+def _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
+    """Add entries of motions for a segment, with `flux` of those from `first` on. Returns their new number."""
     for j in range(8):
         k, e = j // 2, j % 2
         cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
         tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
         before, behind = shown[tie, 0], shown[tie, 1]
         for r in range(4 if before != behind else 0):
-            x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
+            x, y = flux[s - first, k, e, r, 0], flux[s - first, k, e, r, 1]
             b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
             for i in range(2 if b >= 0 and (x != 0 or y != 0) else 0):
                 of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
@@ -372,22 +361,21 @@ def add_squares(
                 continue
             leader = s + hub[s]
             both = members[leader - first] == 1 and ties[s, 1] >= 0
-            path, t, own, share = _path(s, place, gap, square, ties, corner), 0.0, -1, 0.0
+            path, t, own, share = _path(s, place, gap, square, ties, corner), 0.0, 0, 0.0
             if leader != s:
                 t, own, share = _meets(path, _path(leader, place, gap, square, ties, corner))
-            hub_at = corner[leader, 0], corner[leader, 1]
             for e in range(2 if ties[s, 1] >= 0 else 1):
                 side, other = square_sides[s, e], 0.0
                 if both:
                     other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
                 _fill_rates(rates, leader, s, e, t, own, share, pull)
-                ray = path[2 * e], path[1], hub_at
+                ray = path[2 * e], path[1], (corner[leader, 0], corner[leader, 1])
                 at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
                 sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
                 count += 1
         if count > 0:
             _fill_order(count, sides, at, breaks, order)
-            if count > 3:
+            if count > 3:  # Fewer rays do not alternate.
                 _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
             _fill_regions(count, order, hubs, region)
             for k in range(4):
@@ -398,8 +386,6 @@ def add_squares(
                 )  # fmt: skip
         for s in range(first, stop):
             if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(
-                    s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m
-                )
+                m = _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m)
         first = stop
     return n, m

@@ -109,10 +109,8 @@ def push(
             if n < 0 or not len(t_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
-            if left == right and above == below:
-                continue
             mx, my = share * t_positions[n, 0] / 2, share * t_positions[n, 1] / 2
-            for c in range(out.shape[2]):
+            for c in range(out.shape[2] if left != right or above != below else 0):
                 aside, down = colors[right, c] - colors[left, c], colors[below, c] - colors[above, c]
                 out[row, at, c] -= aside * mx + down * my
     used, line = _used(color_weight) if len(t_colors) else 0, first
@@ -160,17 +158,15 @@ def pull(
             n, at = front[y, x], _pixel(j, side)
             if n < 0:
                 continue
-            if len(g_colors):
-                for c in range(g.shape[2]):
-                    g_colors[n, c] += share * g[row, at, c]
+            for c in range(g.shape[2] if len(g_colors) else 0):
+                g_colors[n, c] += share * g[row, at, c]
             if not len(g_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
-            if left != right or above != below:
-                for c in range(g.shape[2]):
-                    half = share * g[row, at, c] / 2
-                    g_positions[n, 0] -= (colors[right, c] - colors[left, c]) * half
-                    g_positions[n, 1] -= (colors[below, c] - colors[above, c]) * half
+            for c in range(g.shape[2] if left != right or above != below else 0):
+                half = share * g[row, at, c] / 2
+                g_positions[n, 0] -= (colors[right, c] - colors[left, c]) * half
+                g_positions[n, 1] -= (colors[below, c] - colors[above, c]) * half
     used, line = _used(color_weight) if len(g_colors) else 0, 0
     for e in range(_first(color_cell, used, border * width), used):
         line = _line(color_cell[e], line, width, border)
