@@ -7,7 +7,9 @@ numba counts references to arrays, one thread after the other: in a loop that is
 be most of the time. A helper that is called for each item counts none if it takes few arrays, has one `return`, no
 `break`, and uses all of them to its end. Views (`a[i]`, `a[b:e]`) and tuples of arrays are counted wherever they are
 made; whole arrays with indices, numbers, and tuples of numbers are not. A helper with `inline="always"` becomes a part
-of the loop and counts none either: a tenth of the time of loops over outlines. Large ones take longer to compile.
+of the loop: a tenth of the time of loops over outlines. Large ones take longer to compile. It counts none either, but
+where it writes to an array in a branch alone, returns early, or takes an item of a tuple by a number known only at run
+time, as a loop over a tuple does.
 """
 
 from __future__ import annotations

@@ -47,24 +47,23 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
         n: the row of `weight`.
         side: the side.
         border: width, in cells, beside borders of pixels in which both have a share.
-        ray: (3, 2), the break, a point between, and where the outlines meet.
+        ray: the break, a point between, and where the outlines meet: x and y of each.
         rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
         other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
     """
-    sign, start = 1.0 if side < 2 else -1.0, on_sides(ray[0, 0], ray[0, 1], side)
+    sign, start = 1.0 if side < 2 else -1.0, on_sides(ray[0][0], ray[0][1], side)
     for k in range(4):
         low = 2.5 if k == 0 or k == 3 else 2.0
         weight[n, k] = 0.5 * max(low + 0.5 - max(start, low), 0.0) - (0.25 if side < k else 0.0)
         length[n, k] = 0.0
-    for p in range(2):
-        x, y = ray[p, 0], ray[p, 1]
-        wx, wy = ray[p + 1, 0] - x, ray[p + 1, 1] - y
+    for p in range(1 if ray[1] == ray[2] else 2):
+        (x, y), (wx, wy) = (ray[0], ray[1]) if p == 0 else (ray[1], ray[2])
+        wx, wy = wx - x, wy - y
         a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
         b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+        end = 0.0
         for m in range(3):
-            begin, end = (0.0 if m == 0 else (min(a, b) if m == 1 else max(a, b))), 1.0
-            if m < 2:
-                end = min(a, b) if m == 0 else max(a, b)
+            begin, end = end, (min(a, b) if m == 0 else (max(a, b) if m == 1 else 1.0))
             dx, dy, t = (end - begin) * wx, (end - begin) * wy, (begin + end) / 2
             if dx == 0 and dy == 0:
                 continue
@@ -85,9 +84,10 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
 
 
 @compiled(inline="always")
-def _along(ax, ay, bx, by, x, y):
+def _along(a, b, point):
     """Where on a straight piece from a to b a point lies, 0 to 1, and its squared distance from there."""
-    dx, dy = bx - ax, by - ay
+    (ax, ay), (x, y) = a, point
+    dx, dy = b[0] - ax, b[1] - ay
     square = dx * dx + dy * dy
     t = ((x - ax) * dx + (y - ay) * dy) / square if square > 0 else 0.0
     t = min(max(t, 0.0), 1.0)
@@ -95,30 +95,30 @@ def _along(ax, ay, bx, by, x, y):
 
 
 @compiled(inline="always")
-def _fill_path(path, s, place, gap, square, ties, corner):
-    """Fill a path (3, 2): start, corner and end of a segment, from the square's first centre."""
-    for e in range(2):
-        b = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-        x, y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
-        path[2 * e, 0], path[2 * e, 1] = _point(place[b], x, y, gap[b, 2])
-    path[1, 0], path[1, 1] = corner[s, 0], corner[s, 1]
+def _path(s, place, gap, square, ties, corner):
+    """The start, corner and end of a segment, from the square's first centre."""
+    a, b = ties[s, 0], ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]
+    start = _point(place[a], gap[a, 1] - square[s, 1], gap[a, 0] - square[s, 0], gap[a, 2])
+    end = _point(place[b], gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0], gap[b, 2])
+    return start, (corner[s, 0], corner[s, 1]), end
 
 
 @compiled(inline="always")
-def _fill_ray(s, h, e, of_hub, path, pull, ray, rates):
-    """Fill the ray (3, 2) and the rates (2, 2, 4) of an end e of row h, to the corner of segment s; see `_weigh_ray`.
+def _meets(path, of_hub):
+    """Where on a half of its hub's path one ends, the number of the rate of this half's end, and where on its chord."""
+    first, near = _along(of_hub[0], of_hub[1], path[1])
+    second, far = _along(of_hub[2], of_hub[1], path[1])
+    share, _ = _along(path[0], path[2], path[1])
+    return (first, 0, share) if near <= far else (second, 3, share)
 
-    `of_hub` and `path` are both paths. The ray runs along the segment s from where it meets that, and moves as that.
+
+@compiled(inline="always")
+def _fill_rates(rates, s, h, e, t, own, share, pull):
+    """Fill the rates (2, 2, 4) of the ray from an end e of row h, to the corner of segment s; see `_weigh_ray`.
+
+    The ray runs along the segment s from where it meets that, and moves as that; t, own and share are of `_meets`, and
+    have no effect if s is h.
     """
-    t, own, share = 0.0, 1 + e, 0.0
-    if s != h:
-        x, y = path[1, 0], path[1, 1]
-        first, near = _along(of_hub[0, 0], of_hub[0, 1], of_hub[1, 0], of_hub[1, 1], x, y)
-        second, far = _along(of_hub[2, 0], of_hub[2, 1], of_hub[1, 0], of_hub[1, 1], x, y)
-        t, own = (first, 0) if near <= far else (second, 3)
-        share, _ = _along(path[0, 0], path[0, 1], path[2, 0], path[2, 1], x, y)
-    for a in range(2):
-        ray[0, a], ray[1, a], ray[2, a] = path[2 * e, a], path[1, a], of_hub[1, a]
     for r in range(4):
         rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
         rates[0, 1, r] = pull[s, r] if s == h else (1 - share if r == 1 else (share if r == 2 else 0.0))
@@ -226,7 +226,7 @@ def _fill_regions(count, order, hubs, region):
             region[q] = own if region[q] == other else region[q]
 
 
-@compiled
+@compiled(inline="always")
 def _add_areas(
     count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, cell, centre, shown, colors,
     parts, n,
@@ -276,8 +276,8 @@ def _add_areas(
     for r in range(count):
         if r == own or area[r] == 0:
             continue
-        for p in range(2 * count):
-            of_hub[hubs[order[p // 2]]] = 0.0
+        for p in range(count):
+            of_hub[hubs[p], 0], of_hub[hubs[p], 1] = 0.0, 0.0
         total = 0.0
         for p in range(2 * count):
             ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
@@ -297,16 +297,16 @@ def _add_areas(
     return n
 
 
-@compiled
-def _add_fluxes(s, local, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
-    """Add entries of motions for a segment, whose fluxes are those of row `local`. Returns their new number."""
+@compiled(inline="always")
+def _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
+    """Add entries of motions for a segment, with `flux` of those from `first` on. Returns their new number."""
     for j in range(8):
         k, e = j // 2, j % 2
         cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
         tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
         before, behind = shown[tie, 0], shown[tie, 1]
         for r in range(4 if before != behind else 0):
-            x, y = flux[local, k, e, r, 0], flux[local, k, e, r, 1]
+            x, y = flux[s - first, k, e, r, 0], flux[s - first, k, e, r, 1]
             b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
             for i in range(2 if b >= 0 and (x != 0 or y != 0) else 0):
                 of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
@@ -343,7 +343,7 @@ def add_squares(
     weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
     at, area = np.empty(2 * most), np.empty(2 * most)
     flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
-    ray, rates, leading, path = np.empty((3, 2)), np.empty((2, 2, 4)), np.empty((3, 2)), np.empty((3, 2))
+    rates = np.empty((2, 2, 4))
     while first < len(square):
         stop, count = first + 1, 0
         while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
@@ -361,19 +361,22 @@ def add_squares(
                 continue
             leader = s + hub[s]
             both = members[leader - first] == 1 and ties[s, 1] >= 0
-            _fill_path(leading, leader, place, gap, square, ties, corner)
-            _fill_path(path, s, place, gap, square, ties, corner)
+            path, t, own, share = _path(s, place, gap, square, ties, corner), 0.0, 0, 0.0
+            if leader != s:
+                t, own, share = _meets(path, _path(leader, place, gap, square, ties, corner))
             for e in range(2 if ties[s, 1] >= 0 else 1):
                 side, other = square_sides[s, e], 0.0
                 if both:
                     other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
-                _fill_ray(leader, s, e, leading, path, pull, ray, rates)
+                _fill_rates(rates, leader, s, e, t, own, share, pull)
+                ray = path[2 * e], path[1], (corner[leader, 0], corner[leader, 1])
                 at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
                 sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
                 count += 1
         if count > 0:
             _fill_order(count, sides, at, breaks, order)
-            _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
+            if count > 3:  # Fewer rays do not alternate.
+                _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
             _fill_regions(count, order, hubs, region)
             for k in range(4):
                 y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
@@ -383,8 +386,6 @@ def add_squares(
                 )  # fmt: skip
         for s in range(first, stop):
             if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(
-                    s, s - first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m
-                )
+                m = _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m)
         first = stop
     return n, m

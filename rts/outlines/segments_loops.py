@@ -216,18 +216,16 @@ def _cost(a, b, ends, place, tangent, cells_away):
         front, back = back, front
     if front != other_front and ends[b, 2] == 0 and front == other_back:
         other_front, other_back = other_back, other_front
-    if front != other_front or ends[a, 2] * ends[b, 2] > 0:
-        return np.inf
     p, q = ends[a, 0], ends[b, 0]
     dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], 0.0
-    for i in (p, q):
-        tx, ty = tangent[i, 0], tangent[i, 1]
+    for e in range(2):
+        tx, ty = _row(tangent, p if e == 0 else q)
         aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
         cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
     cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
     apart = abs(cells_away[p] - cells_away[q])
     cost += OTHER_DEPTH * apart / (apart + FAR) if apart > 0 else 0.0  # Unknown ones are NaN.
-    return cost + OTHER_KIND * crosses
+    return np.inf if front != other_front or ends[a, 2] * ends[b, 2] > 0 else cost + OTHER_KIND * crosses
 
 
 @compiled(inline="always")
@@ -595,7 +593,7 @@ def meet(origin, ties, square_sides, place, tangent, near, hub, corner, pull, ne
         stop = first + 1
         while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
             stop += 1
-        for s in range(first, stop):
+        for s in range(first, stop if stop > first + 1 else first):  # One alone in its square meets none.
             way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
             hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near)
         lead, alone = -1, True

@@ -118,13 +118,11 @@ def _add_sides(
 
 @compiled(inline="always")
 def _add_motion(motions, rates, m, cell, sample, share, moves, color, other):
-    """Add an entry of motions along x and y, unless it is 0. Returns the new number of entries."""
+    """Add an entry of motions along x and y; the next one replaces it if it is 0. Returns the new number of entries."""
     x, y = share * moves[0], share * moves[1]
-    if sample >= 0 and color != other and (x != 0 or y != 0):
-        motions[m, 0], motions[m, 1], motions[m, 2], motions[m, 3] = cell, sample, color, other
-        rates[m, 0], rates[m, 1], rates[m, 2] = x, y, 0.0
-        m += 1
-    return m
+    motions[m, 0], motions[m, 1], motions[m, 2], motions[m, 3] = cell, sample, color, other
+    rates[m, 0], rates[m, 1], rates[m, 2] = x, y, 0.0
+    return m + (sample >= 0 and color != other and (x != 0 or y != 0))
 
 
 @compiled
@@ -269,7 +267,7 @@ def _in_lines(
         breaks += begin - 1 <= gap[b, 0] < end
     most = 20 * segments + 4 * breaks
     colors, parts = np.empty((most, 3), np.int32), np.empty(most)
-    most = 64 * segments + 8 * breaks * len(row)
+    most = 64 * segments + 8 * breaks * len(row) + 1  # The last may be one of 0.
     motions, rates = np.empty((most, 4), np.int32), np.empty((most, 3))
     n, m = add_squares(
         begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,

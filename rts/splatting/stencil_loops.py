@@ -36,6 +36,12 @@ def _line(cell, line, width, border):
 
 
 @compiled(inline="always")
+def _pixel(cell, side):
+    """The line or column of pixels in which one of cells lies: without a slow division where each pixel is a cell."""
+    return cell if side == 1 else cell // side
+
+
+@compiled(inline="always")
 def _of(colors, n, c):
     """A channel of a colour; 0 for none."""
     return colors[np.uint32(n), c] if n >= 0 else 0.0
@@ -63,14 +69,15 @@ def value(first, last, border, side, colors, front, color_cell, color_sample, co
     """
     width, used, share = front.shape[1], _used(color_weight), 1 / side**2
     for i in range(first * side, last * side):
-        if i % side == 0:
-            out[i // side] = 0.0
+        row = _pixel(i, side)
+        if row * side == i:
+            out[row] = 0.0
         for j in range(out.shape[1]):
             for k in range(j * side, j * side + side):
                 # Compiled code need not check for negative ones.
                 n = front[np.uint32(i + border), np.uint32(k + border)]
                 for c in range(out.shape[2]):
-                    out[i // side, j, c] += share * _of(colors, n, c)
+                    out[row, j, c] += share * _of(colors, n, c)
     line, last = first * side, last * side
     for e in range(_first(color_cell, used, (line + border) * width), used):
         line = _line(color_cell[e], line, width, border)
@@ -78,8 +85,9 @@ def value(first, last, border, side, colors, front, color_cell, color_sample, co
         if line >= last:
             break
         if 0 <= j < out.shape[1] * side:
+            row, at = _pixel(line, side), _pixel(j, side)
             for c in range(out.shape[2]):
-                out[line // side, j // side, c] += share * color_weight[e] * _of(colors, color_sample[e], c)
+                out[row, at, c] += share * color_weight[e] * _of(colors, color_sample[e], c)
 
 
 @loop
@@ -92,20 +100,19 @@ def push(
     out[first:last] = 0.0
     first, last = first * side, last * side
     for i in range(first, last):
+        row = _pixel(i, side)
         for j in range(out.shape[1] * side):
             y, x = np.uint32(i + border), np.uint32(j + border)
-            n, at = front[y, x], j // side
+            n, at = front[y, x], _pixel(j, side)
             for c in range(out.shape[2] if len(t_colors) else 0):
-                out[i // side, at, c] += share * _of(t_colors, n, c)
+                out[row, at, c] += share * _of(t_colors, n, c)
             if n < 0 or not len(t_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
-            if left == right and above == below:
-                continue
             mx, my = share * t_positions[n, 0] / 2, share * t_positions[n, 1] / 2
-            for c in range(out.shape[2]):
+            for c in range(out.shape[2] if left != right or above != below else 0):
                 aside, down = colors[right, c] - colors[left, c], colors[below, c] - colors[above, c]
-                out[i // side, at, c] -= aside * mx + down * my
+                out[row, at, c] -= aside * mx + down * my
     used, line = _used(color_weight) if len(t_colors) else 0, first
     for e in range(_first(color_cell, used, (first + border) * width), used):
         line = _line(color_cell[e], line, width, border)
@@ -113,8 +120,9 @@ def push(
         if line >= last:
             break
         if 0 <= j < out.shape[1] * side:
+            row, at = _pixel(line, side), _pixel(j, side)
             for c in range(out.shape[2]):
-                out[line // side, j // side, c] += share * color_weight[e] * _of(t_colors, color_sample[e], c)
+                out[row, at, c] += share * color_weight[e] * _of(t_colors, color_sample[e], c)
     used, line = _used(motion_weight) if len(t_positions) else 0, first
     for e in range(_first(motion_cell, used, (first + border) * width), used):
         line = _line(motion_cell[e], line, width, border)
@@ -122,10 +130,11 @@ def push(
         if line >= last:
             break
         if 0 <= j < out.shape[1] * side:
+            row, at = _pixel(line, side), _pixel(j, side)
             rate = share * _rate(motion_weight, e, t_positions, motion_sample[e])
             for c in range(out.shape[2]):
                 jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
-                out[line // side, j // side, c] += rate * jump
+                out[row, at, c] += rate * jump
 
 
 @compiled(inline="always")
@@ -143,22 +152,21 @@ def pull(
     """Add to gradients of positions and colours those of `g` (h, w, C); empty ones are not wanted."""
     width, share, lines = front.shape[1], 1 / side**2, g.shape[0] * side
     for i in range(lines):
+        row = _pixel(i, side)
         for j in range(g.shape[1] * side):
             y, x = np.uint32(i + border), np.uint32(j + border)
-            n, at = front[y, x], j // side
+            n, at = front[y, x], _pixel(j, side)
             if n < 0:
                 continue
-            if len(g_colors):
-                for c in range(g.shape[2]):
-                    g_colors[n, c] += share * g[i // side, at, c]
+            for c in range(g.shape[2] if len(g_colors) else 0):
+                g_colors[n, c] += share * g[row, at, c]
             if not len(g_positions):
                 continue
             left, right, above, below = _beside(front, joined, y, x)
-            if left != right or above != below:
-                for c in range(g.shape[2]):
-                    half = share * g[i // side, at, c] / 2
-                    g_positions[n, 0] -= (colors[right, c] - colors[left, c]) * half
-                    g_positions[n, 1] -= (colors[below, c] - colors[above, c]) * half
+            for c in range(g.shape[2] if left != right or above != below else 0):
+                half = share * g[row, at, c] / 2
+                g_positions[n, 0] -= (colors[right, c] - colors[left, c]) * half
+                g_positions[n, 1] -= (colors[below, c] - colors[above, c]) * half
     used, line = _used(color_weight) if len(g_colors) else 0, 0
     for e in range(_first(color_cell, used, border * width), used):
         line = _line(color_cell[e], line, width, border)
@@ -166,8 +174,9 @@ def pull(
         if line >= lines:
             break
         if 0 <= j < g.shape[1] * side and n >= 0:
+            row, at = _pixel(line, side), _pixel(j, side)
             for c in range(g.shape[2]):
-                g_colors[n, c] += share * color_weight[e] * g[line // side, j // side, c]
+                g_colors[n, c] += share * color_weight[e] * g[row, at, c]
     used, line = _used(motion_weight) if len(g_positions) else 0, 0
     for e in range(_first(motion_cell, used, border * width), used):
         line = _line(motion_cell[e], line, width, border)
@@ -175,10 +184,11 @@ def pull(
         if line >= lines:
             break
         if 0 <= j < g.shape[1] * side:
+            row, at = _pixel(line, side), _pixel(j, side)
             total = 0.0
             for c in range(g.shape[2]):
                 jump = _of(colors, motion_colors[e, 0], c) - _of(colors, motion_colors[e, 1], c)
-                total += share * jump * g[line // side, j // side, c]
+                total += share * jump * g[row, at, c]
             for a in range(3):
                 g_positions[n, a] += motion_weight[e, a] * total
 
