@@ -215,26 +215,6 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch):
         np.testing.assert_array_equal(x, y)
 
 
-def test_a_jitted_render_has_the_gradients_of_an_eager_one():
-    vertices, faces = icosphere(2)
-    part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {}, "lambert")
-    camera, size = rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (90, 120)
-
-    def loss(pose, vertices):
-        moved = part.replace(theta={"vertices": vertices}, transform=rts.rigid(pose))
-        return (rts.render(moved, camera, size)[..., :2] ** 2).sum()
-
-    pose, vertices = jnp.asarray([0.1, -0.2, 0.1, 0.05, 0.02, 0.1]), jnp.asarray(vertices, jnp.float32)
-    gradient = jax.grad(loss, (0, 1))
-    for x, y in zip(jax.jit(gradient)(pose, vertices), gradient(pose, vertices), strict=True):
-        close(x, y)
-    constant = jax.grad(lambda p: loss(p, np.asarray(vertices)))
-    close(jax.jit(constant)(pose), gradient(pose, vertices)[0])
-    both = jnp.stack([pose, -pose])
-    for x, y in zip(jax.jit(jax.vmap(constant))(both), both, strict=True):
-        close(x, constant(y))
-
-
 @pytest.mark.parametrize("constant", [True, False])
 def test_a_shader_may_divide_by_what_it_reads(constant):
     # Rows that are allotted but not used hold what makes no NaN of a zero gradient.
@@ -268,16 +248,6 @@ def test_points_without_an_image_are_finite_with_finite_gradients():
         for x in (value, *pull(jnp.ones_like(value)), pushed):
             assert np.isfinite(x).all()
         np.testing.assert_allclose(value, projected(rows, points), rtol=1e-4)
-
-
-@pytest.mark.parametrize("wrong", [ROWS, -1, 2**30])
-def test_an_id_of_no_row_is_one_clear_error(wrong):
-    rows, weights = FUNCTIONS["interpolation"][2]
-    ids = jnp.asarray(IDS).at[2, COLUMN + 1].set(wrong)
-    for name, mode in MODES.items():
-        kind = rts.InputError if name == "eager" else Exception  # Of jax's own, with our words in it.
-        with pytest.raises(kind, match=f"refer to row {wrong} of {ROWS} rows; sample this surface anew"):
-            jax.block_until_ready(mode(lambda r, w: interpolate(r, ids, COLUMN, w))(rows, weights))
 
 
 def test_weights_that_do_not_count_have_no_gradient():

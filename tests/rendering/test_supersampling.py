@@ -43,16 +43,6 @@ def test_a_pixel_is_the_average_of_its_samples(target, s):
     np.testing.assert_allclose(to_numpy(image(vertices, s)), averaged(fine, s), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("target", ALL)
-def test_bands_make_no_difference_to_the_image(target, narrow_bands, monkeypatch):
-    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 3
-    vertices, background = arrays(target, (CORNERS, np.random.default_rng(0).random((*SIZE, 3))))
-    found = to_numpy(image(vertices, 3, background=background))
-    monkeypatch.undo()
-    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 1
-    np.testing.assert_allclose(found, to_numpy(image(vertices, 3, background=background)), rtol=0, atol=2e-5)
-
-
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
     vertices, weights = arrays(target, (CORNERS, np.random.default_rng(1).normal(size=(*SIZE, 4))))
@@ -68,19 +58,6 @@ def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
         np.testing.assert_allclose(found[band][0].sum(), slope, rtol=1e-3)
     for whole, banded in zip(*found.values(), strict=True):
         np.testing.assert_allclose(banded, whole, rtol=1e-3, atol=1e-3)
-
-
-def test_bands_work_under_jit_and_torch_func(narrow_bands):
-    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
-
-    def loss(v):
-        return (image(v, 3)[..., :3] ** 2).sum()
-
-    expected = gradient("torch-cpu", loss, arrays("torch-cpu", CORNERS))
-    by_func = torch.func.grad(loss)(arrays("torch-cpu", CORNERS)).numpy()
-    by_jit = np.asarray(jax.jit(jax.grad(loss))(arrays("jax", CORNERS)))
-    np.testing.assert_allclose(by_func, expected, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_jit, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
@@ -177,13 +154,6 @@ def test_a_background_has_its_gradient_over_bands_of_constants(target, narrow_ba
     found = gradient(target, lambda b: image(CORNERS, 3, background=b).sum(), background)
     alpha = image(CORNERS, 3)[..., 3:]
     np.testing.assert_allclose(found, np.broadcast_to(1 - alpha, found.shape), atol=1e-5)
-
-
-def test_prepared_parts_are_rendered_in_bands(narrow_bands):
-    part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
-    np.testing.assert_array_equal(
-        rts.render(rts.prepare(part), CAMERA, SIZE, supersample=3), rts.render(part, CAMERA, SIZE, supersample=3)
-    )
 
 
 def test_sampled_knows_its_samples_a_pixel():
