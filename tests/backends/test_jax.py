@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from helpers import arrays, relative_error, rigid, to_numpy
+from second_plugin.torus import Torus
 from test_engines import (
     EYES,
     MESH,
@@ -204,6 +205,18 @@ def test_map_rows_is_one_loop_in_a_compiled_program(jax):
     rows = np.arange(23, dtype=np.float32)
     np.testing.assert_array_equal(jax.jit(lambda x: engine.map_rows(f, x, 5))(rows), 2 * rows + 1)
     assert set(calls) == {5} and len(calls) < 5
+
+
+def test_a_loop_in_a_program_is_one_loop(jax):
+    """Rays at a torus, which are traced in steps."""
+    part, camera = Torus.example(), camera_at(EYES[0])
+
+    def total(radii):
+        return rts.render(part.replace(theta={**part.theta, "radii": radii}), camera, SIZE, layers=2).sum()
+
+    radii = jax.numpy.asarray(part.theta["radii"])
+    for f in (total, jax.grad(total), lambda radii: jax.vmap(total)(jax.numpy.stack([radii, radii]))):
+        assert str(jax.make_jaxpr(f)(radii)).count("while[") == 1
 
 
 def fan(count):
