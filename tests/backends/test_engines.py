@@ -10,7 +10,6 @@ from helpers import (
     TORCH,
     arrays,
     derivative,
-    finite_difference,
     gradient,
     icosphere,
     relative_error,
@@ -115,25 +114,6 @@ def test_the_derivative_of_render_is_that_at_frozen_samples(target):
 
 # Its image of frozen samples has the derivative that it says; shares of pixels beside found edges have no value of it.
 STILL = "multi"
-
-
-@pytest.mark.parametrize("target", TORCH)
-def test_in_double_precision_the_gradient_at_frozen_samples_is_the_finite_difference(target):
-    scene = arrays(target, SCENE, np.float64)
-    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE, splatter=STILL)
-    weights = arrays(target, WEIGHTS, np.float64)
-
-    def f(s):
-        image = rts.render_samples(sampled, part_of(s), camera_at(s["eye"]), splatter=STILL)
-        assert str(image.dtype) == "torch.float64"
-        return (image * weights).sum()
-
-    found = gradient(target, f, scene)
-    for key in ("transform", "eye"):
-        by_differences = finite_difference(
-            lambda x, key=key: f({**scene, key: arrays(target, x, np.float64)}).item(), SCENE[key]
-        )
-        np.testing.assert_allclose(found[key], by_differences, rtol=1e-5, atol=1e-5 * np.abs(by_differences).max())
 
 
 @pytest.mark.parametrize("target", TORCH)
