@@ -177,6 +177,12 @@ def test_only_normals_of_the_file_are_kept(tmp_path):
     np.testing.assert_allclose(part.theta["normals"], mesh.vertex_normals, atol=1e-6)
 
 
+def test_polygons_become_triangles_and_negative_indices_count_back(tmp_path):
+    text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n" + "v 0 0 1\nv 1 0 1\nv 1 1 1\nf -3 -2 -1\n"
+    [part] = rts.load(write(tmp_path / "m.obj", text))
+    np.testing.assert_array_equal(part.surface.faces, [[0, 1, 2], [0, 2, 3], [4, 5, 6]])
+
+
 def test_comments_continuations_and_colors_of_an_obj(tmp_path):
     text = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0 # tip\nv 0 1 0 0 0.5 1\nf 1 2 \\\n3 # one\n"
     [part] = rts.load(write(tmp_path / "m.obj", text))

@@ -43,6 +43,16 @@ def test_a_pixel_is_the_average_of_its_samples(target, s):
     np.testing.assert_allclose(to_numpy(image(vertices, s)), averaged(fine, s), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_bands_make_no_difference_to_the_image(target, narrow_bands, monkeypatch):
+    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 3
+    vertices, background = arrays(target, (CORNERS, np.random.default_rng(0).random((*SIZE, 3))))
+    found = to_numpy(image(vertices, 3, background=background))
+    monkeypatch.undo()
+    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 1
+    np.testing.assert_allclose(found, to_numpy(image(vertices, 3, background=background)), rtol=0, atol=2e-5)
+
+
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
     vertices, weights = arrays(target, (CORNERS, np.random.default_rng(1).normal(size=(*SIZE, 4))))

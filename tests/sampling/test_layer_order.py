@@ -38,6 +38,15 @@ def column(*depths, camera=PLANES):
 # ------------------------------------------------------------------------------------------------ settle
 
 
+def test_layers_out_of_order_are_sorted():
+    assert column(5, 3, 7, 2) == ([3, 1, 0, 2], [2, 3, 5, 7])
+
+
+def test_rows_of_minus_one_leave_no_gap():
+    assert column(None, 5, None, 3) == ([3, 1, -1, -1], [3, 5, 0, 0])
+    assert column(None, None) == ([-1, -1], [0, 0])
+
+
 @pytest.mark.parametrize("view", ["perspective", "orthographic"])
 def test_two_layers_at_one_root_become_one_and_the_width_of_a_pixel_decides(view):
     camera = VIEWS[view]
