@@ -1,4 +1,4 @@
-"""Surfaces that are not their triangles: Bézier patches, refined by Newton's method, and a torus, sphere-traced."""
+"""Surfaces that are not their triangles: Bézier patches, refined by Newton's method, and sheets."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import rts
 from rts.arrays.array_functions import described
 from rts.operations.unit import unit
 from rts.plugin_api.operations import combine
-from rts.plugin_api.records import ArraySpec, Proxy, RayHits
+from rts.plugin_api.records import ArraySpec, Proxy
 
 
 class Bezier(rts.TriangleSurface):
@@ -175,125 +175,6 @@ class Crowded(Sheets):
         xp = rts.namespace(samples.ids)
         places = xp.take(samples.tables["places"], samples.ids[:, 0], axis=0)
         return self.at(theta, places[:, :2], xp.astype(places[:, 2], samples.ids.dtype))
-
-
-class Torus(rts.RaySurface):
-    """θ["radii"] (2,): of the circle in the plane y = 0, and of the tube around it.
-
-    A sample is the cosine and sine of its angle about the axis, and of that about the circle.
-    """
-
-    sample_widths = (0, 4)
-    most = 400
-    least = 1e-3
-    """Step near the surface, which rays that touch it for less than this may miss."""
-
-    def check(self, theta):
-        if tuple(getattr(theta.get("radii"), "shape", ())) != (2,):
-            raise rts.InputError(f"theta['radii'] {described(theta.get('radii'))}; expected (2,)")
-
-    def reads(self, theta):
-        return ("radii",)
-
-    def evaluate(self, theta, samples):
-        xp, (large, small) = rts.namespace(theta["radii"], samples.params), (theta["radii"][i] for i in range(2))
-        about_axis, about_circle = samples.params[:, :2], samples.params[:, 2:]
-        out = large + small * about_circle[:, 0]
-        position = xp.stack([out * about_axis[:, 0], small * about_circle[:, 1], out * about_axis[:, 1]], axis=-1)
-        gbuffer = rts.GBuffer(position=position)
-
-        def normal():
-            radial = about_circle[:, 0]
-            parts = radial * about_axis[:, 0], about_circle[:, 1], radial * about_axis[:, 1]
-            return xp.astype(xp.stack(parts, axis=-1), position.dtype)
-
-        gbuffer.defer("normal", normal)
-        return gbuffer
-
-    def intersect(self, theta, origins, directions, layers):
-        """Steps as long as the surface is far, over it where it is near; each change of sign holds one hit."""
-        xp, radii = rts.namespace(origins), theta["radii"]
-
-        def value(t):
-            return distance(radii, origins + t[..., None] * directions)
-
-        length = xp.sqrt(xp.sum(directions * directions, axis=-1))
-        last = leaving(origins, directions, radii[0] + radii[1] + self.least)
-        zero = xp.zeros_like(length)
-        none = xp.stack([zero] * layers)
-
-        def going(state):
-            return (state["count"] < layers) & (state["t"] < last)
-
-        def body(state):
-            t, before, count = state["t"], state["value"], state["count"]
-            further = t + xp.where(going(state), xp.clip(xp.abs(before), self.least, None) / length, 0.0)
-            after = value(further)
-            crossed = going(state) & ((after > 0) != (before > 0))
-            here = xp.stack([crossed & (count == k) for k in range(layers)])
-            return {
-                "t": further,
-                "value": after,
-                "count": count + xp.astype(crossed, count.dtype),
-                "low": xp.where(here, t, state["low"]),
-                "high": xp.where(here, further, state["high"]),
-            }
-
-        state = {
-            "t": zero,
-            "value": value(zero),
-            "count": xp.zeros_like(zero, dtype=xp.int32),
-            "low": none,
-            "high": none,
-        }
-        state = rts.engine_of(origins).repeat(body, lambda s: xp.any(going(s)), state, self.most)
-        hits = xp.stack([state["count"] > k for k in range(layers)])
-        t = root(value, state["low"], state["high"])
-        point = origins + t[..., None] * directions
-        about_axis = unit(xp.stack([point[..., 0], point[..., 2]], axis=-1))
-        out = point[..., 0] * about_axis[..., 0] + point[..., 2] * about_axis[..., 1] - radii[0]
-        about_circle = unit(xp.stack([out, point[..., 1]], axis=-1))
-        return RayHits(hits, t, xp.concat([about_axis, about_circle], axis=-1))
-
-    @classmethod
-    def example(cls):
-        return rts.Part(cls(), {"radii": np.array([0.9, 0.35], np.float32)}, "normals")
-
-
-def distance(radii, points):
-    """The signed distance of points (..., 3) to a torus, negative inside."""
-    xp = rts.namespace(radii, points)
-
-    def length(a, b):  # Its derivative is finite at zero, too.
-        square = a * a + b * b
-        positive = square > 0
-        return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
-
-    return length(length(points[..., 0], points[..., 2]) - radii[0], points[..., 1]) - radii[1]
-
-
-def leaving(origins, directions, radius):
-    """Where rays leave a ball about the origin, in units of their directions; 0 for those that do not meet it."""
-    xp = rts.namespace(origins)
-    a, b, c = (xp.sum(x * y, axis=-1) for x, y in ((directions,) * 2, (origins, directions), (origins,) * 2))
-    square = b * b - a * (c - radius * radius)
-    return xp.where(square > 0, (xp.sqrt(xp.where(square > 0, square, 1.0)) - b) / a, 0.0)
-
-
-def root(f, low, high, steps=6):
-    """Where a function changes its sign between two arguments, by the method of Illinois; `low` where they are one."""
-    xp = rts.namespace(low)
-    below, above = f(low), f(high)
-    for _ in range(steps):
-        slope = above - below
-        middle = low - below * (high - low) / xp.where(slope == 0, 1.0, slope)
-        middle = xp.minimum(xp.maximum(middle, low), high)
-        value = f(middle)
-        first = (value > 0) == (below > 0)
-        # The end that stays counts half, lest it stay for ever.
-        low, high = xp.where(first, middle, low), xp.where(first, high, middle)
-        below, above = xp.where(first, value, 0.5 * below), xp.where(first, 0.5 * above, value)
-    return xp.where(xp.abs(above) < xp.abs(below), high, low)
 
 
 def ball_of_field(theta, points):

@@ -165,6 +165,14 @@ def box(half=1.0, center=(0.0, 0.0, 0.0)):
     return vertices * np.float32(half) + np.asarray(center, np.float32), np.array(faces, np.int32)
 
 
+def crooked_box():
+    """Vertices (8, 3) and faces (12, 3) of a box that no turn maps to itself."""
+    vertices, faces = box(0.5)
+    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
+    vertices *= 1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32)
+    return vertices, faces
+
+
 def quad(left=-1.0, right=1.0, bottom=-1.0, top=1.0, z=0.0):
     """Vertices (4, 3) and faces (2, 3) of a rectangle that faces +z."""
     vertices = np.array([(left, bottom, z), (right, bottom, z), (right, top, z), (left, top, z)], np.float32)

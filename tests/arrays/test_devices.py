@@ -311,18 +311,6 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     assert np.linalg.norm(tangent) > 0 and relative_error(place.take(moved), tangent) < 10 * exact
 
 
-def test_views_of_one_call(place):
-    case = CASES["two parts"]()
-    cameras = [CAMERA, rts.Camera.look_at((-2.0, 1.0, 3.0), (0, 0, 0), fov_y=45, aspect=SIZE[1] / SIZE[0])]
-
-    def images(tree):
-        parts = [part.replace(theta=theta) for part, theta in zip(case.parts, tree["theta"], strict=True)]
-        return rts.render_views(parts, cameras, SIZE)
-
-    found, expected = place.take(images(place.put(arrays_of(case)))), to_numpy(images(CPU.put(arrays_of(case))))
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
 # ----------------------------------------------------------------------------------------------------------- fits
 
 POSE = np.array([0.1, -0.05, 0.08, 0.05, 0.03, -0.04])

@@ -163,15 +163,6 @@ def test_raster_finds_what_the_reference_finds_among_thousands(camera):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_fewer_layers_are_the_first_of_more(sampler):
-    vertices, faces = soup(100, size=0.5)
-    few = rasterize(sampler, vertices, faces, CAMERAS["perspective"], SIZE, 2)
-    many = rasterize(sampler, vertices, faces, CAMERAS["perspective"], SIZE, 5)
-    for found, expected in zip(few, many, strict=True):
-        np.testing.assert_array_equal(found, expected[:2])
-
-
-@pytest.mark.parametrize("sampler", SAMPLERS)
 def test_of_triangles_at_one_depth_the_first_is_in_front(sampler):
     vertices, faces = quad(-9, 9, -9, 9)
     faces = np.concatenate([faces, faces, faces])

@@ -21,7 +21,6 @@ pytest.importorskip("numba")
 FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "120")).split(":")[-2:])
 STEP = 30
 groups = pytest.mark.parametrize("first", quick(range(FIRST, LAST, STEP)))
-MESH = rts.plugin("rts.surfaces", "mesh")
 _samplers = {}
 
 

@@ -93,17 +93,6 @@ def by_each(given):
     return [(of_one(i), x) for i, x in enumerate(given)]
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_of_many(many, dtype, tolerance):
-    f, plain, given = many
-    args = given(dtype=dtype, count=20000)
-    torch.testing.assert_close(f(*args), plain(*args), rtol=tolerance, atol=tolerance)
-    weights = torch.rand(20000, 3, dtype=dtype)
-    found, expected = (torch.func.grad(lambda a, b, f=f: (f(a, b) * weights).sum(), (0, 1))(*args) for f in (f, plain))
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=100 * tolerance, atol=100 * tolerance * float(b.abs().max()))
-
-
 def test_both_modes_and_second_derivatives_by_finite_differences(case):
     f, _, given = case
     args = [x.requires_grad_(True) for x in given()]
@@ -253,16 +242,6 @@ def test_without_private_names_values_and_gradients_are_the_same(surface, monkey
     torch.testing.assert_close(less, expected)
 
 
-def test_samples_of_another_mesh_are_one_clear_error():
-    rows, weights = corners()
-    with pytest.raises(rts.InputError, match="refer to row 5 of 3 rows; sample this surface anew"):
-        interpolate(rows[:3], torch.full((7, 5), 5), COLUMN, weights)
-    with pytest.raises(rts.InputError, match="row -1 of 6 rows"):
-        interpolate(rows, torch.full((7, 5), -1), COLUMN, weights)
-    with pytest.raises(rts.InputError, match=r"ids of shape \(7, 3\).*expected \(N, 5\)"):
-        interpolate(rows, torch.zeros((7, 3), dtype=torch.int32), COLUMN, weights)
-
-
 def test_double_vertices_take_compiled_code_with_single_weights():
     rows, weights = corners()
     found = interpolated(rows, weights.float())
@@ -274,11 +253,6 @@ def test_gradients_of_rows_that_are_taken_often_are_the_same_each_time():
     rows, index = torch.rand(50, 3), torch.randint(0, 50, (10000,))
     first, second = (torch.func.grad(lambda x: (take(x, index) ** 2).sum())(rows) for _ in range(2))
     assert torch.equal(first, second)
-
-
-def test_an_index_out_of_bounds_is_an_error():
-    with pytest.raises(rts.InputError, match="rows from 5 to 5 were asked for; expected 0 to 4"):
-        take(torch.rand(5, 3), torch.tensor([5]))
 
 
 def test_gradients_do_not_depend_on_the_number_of_threads(many, monkeypatch):

@@ -185,8 +185,6 @@ def test_a_mode_in_which_the_triangles_are_others_has_no_derivative():
 
 TEXTURE = np.full((4, 4, 3), 0.5)
 SQUARE = card(-0.5, -0.4, 0.6, 0.3)
-SDF = rts.plugin("rts.surfaces", "sdf").example()
-PARALLEL = rts.Camera.orthographic((0, 0, 3), (0, 0, 0), height=2)
 LEFT_OUT = {
     "a texture": (SQUARE.replace(theta={**SQUARE.theta, "texture": TEXTURE}), CAMERA, "part 0 has a texture"),
     "a shader": (SQUARE.replace(shader="lambert"), CAMERA, "the shader of part 0 is Lambert"),

@@ -20,7 +20,7 @@ MESH = rts.plugin("rts.surfaces", "mesh")
 SIZE = (32, 32)
 CAMERA = rts.Camera.orthographic((0, 0, 20), (0, 0, 0), height=32)  # A world unit is a pixel.
 EYE = rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, near=0.5, far=20)
-RED, BLUE, GREEN = np.array([0.9, 0.3, 0.2]), np.array([0.2, 0.4, 0.9]), np.array([0.3, 0.8, 0.3])
+RED, BLUE = np.array([0.9, 0.3, 0.2]), np.array([0.2, 0.4, 0.9])
 
 
 def constant(x, value):

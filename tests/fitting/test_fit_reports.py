@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, to_numpy
+from helpers import DIFFERENTIABLE, arrays, box, crooked_box, icosphere, mesh_part, quad, to_numpy
 
 import rts
 from rts.errors import EngineError, InputError
@@ -168,10 +168,7 @@ def test_nothing_is_called_open_where_all_is_determined(target):
 
 
 def silhouette(supersample):
-    vertices, faces = box(0.5)
-    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
-    vertices = vertices * (1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32))
-    part = rts.Part(MESH(faces), {"vertices": vertices})
+    part = mesh_part(crooked_box())
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40, aspect=1.0)
 
     def moved(p):

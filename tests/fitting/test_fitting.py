@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, to_numpy
+from helpers import DIFFERENTIABLE, arrays, crooked_box, mesh_part, to_numpy
 from linear_problem import MATRIX, SOLUTION, joined, line
 
 import rts
@@ -335,17 +335,9 @@ SIZE = (40, 40)
 POSE = np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08], np.float32)
 
 
-def block():
-    """A crooked box: no turn maps it to itself."""
-    vertices, faces = box(0.5)
-    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
-    vertices *= 1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32)
-    return rts.Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices})
-
-
 def silhouette_residuals(target, splatter):
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
-    part = block()
+    part = mesh_part(crooked_box())
 
     def silhouette(pose):
         moved = part.replace(transform=rts.rigid(pose))

@@ -4,7 +4,7 @@ import contextlib
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
+from helpers import DIFFERENTIABLE, arrays, box, crooked_box, icosphere, quad, soup, to_numpy
 
 import rts
 import rts.fitting.least_squares
@@ -314,16 +314,10 @@ def test_the_jacobian_of_blurred_residuals_is_of_samples_that_are_found_once(tar
 # ------------------------------------------------------------------------------------------------------------ fits
 
 
-def block():
-    vertices, faces = box(0.5)
-    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
-    return mesh(vertices * (1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32)), faces)
-
-
 @targets
 @pytest.mark.parametrize("jit", [True, False])
 def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
-    part = block()
+    part = mesh(*crooked_box())
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
     moved = lambda p: part.replace(transform=rts.rigid(p))  # noqa: E731
     goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40))[..., 3]

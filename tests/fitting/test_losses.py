@@ -211,28 +211,6 @@ def test_normal_equations_in_a_compiled_program():
         np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-4, atol=1e-7)
 
 
-def test_every_way_has_the_same_number():
-    """Compiled and in array code, in NumPy, of views, and of a stage as large as the image."""
-    torch = pytest.importorskip("torch")
-    options = {"loss": "huber", "f_scale": 0.1}
-    expected = float(mean_loss(residuals("lambert", 4, **options))(torch.tensor(POSE)))
-    assert expected < 0.7 * float(mean_loss(residuals("lambert", 4))(torch.tensor(POSE)))
-    image, weights = goal(4)
-    several = rts.ImageResiduals(
-        *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2),
-        weights=[weights] * 2,
-        **options,
-    )
-    ways = [
-        mean_loss(residuals("lambert", 4, **options))(POSE),
-        mean_loss(residuals("lambert", 4, **options).at_stage(rts.Stage()))(torch.tensor(POSE)),
-        mean_loss(several)(torch.tensor(POSE)),
-        several.normal_equations(torch.tensor(POSE))[0],
-        rts.Loss("huber", 0.1)(several(torch.tensor(POSE))),
-    ]
-    np.testing.assert_allclose([float(x) for x in ways], expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize("sigma", [0.0, 0.8])
 def test_stages_have_the_loss_of_their_own_residuals(sigma):
     torch = pytest.importorskip("torch")

@@ -9,7 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, 
 import rts
 from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
-from rts.operations.linear import affine_map, affine_map_of_views, matmul
+from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import TAKE, take
 from rts.operations.texels import TEXELS, texels
@@ -211,41 +211,6 @@ def test_loops_get_arrays_one_by_one_that_are_contiguous_and_read_only():
     assert not seen
     with pytest.raises(rts.InputError, match="scale is not of 3"):
         operation.forward((x, scale[:2]), out)
-
-
-def test_torch_checks_it_to_second_order():
-    torch = pytest.importorskip("torch")
-    given = [torch.tensor(x, requires_grad=True) for x in operands()]
-    f = lambda x, s: CLAMP(x, s, power=2)  # noqa: E731
-    assert torch.autograd.gradcheck(f, given, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(f, given)
-    batch = torch.rand(4, 6, 3, dtype=torch.float64)
-    found = torch.vmap(f, (0, None))(batch, given[1])
-    torch.testing.assert_close(found, torch.stack([f(x, given[1]) for x in batch]))
-    slopes = torch.vmap(torch.func.grad(lambda x: f(x, given[1]).sum()))(batch)
-    torch.testing.assert_close(slopes, torch.stack([torch.func.grad(lambda x: f(x, given[1]).sum())(x) for x in batch]))
-
-
-def test_jax_compiles_batches_and_differentiates_it_twice(calls):
-    jax = pytest.importorskip("jax")
-    x, scale = arrays("jax", operands())
-    f = lambda x, s: CLAMP(x, s, power=2)  # noqa: E731
-    plain = lambda x, s: specification(x, s, power=2)  # noqa: E731
-    total = lambda f: lambda x, s: (f(x, s) ** 2).sum()  # noqa: E731
-    for transform in (
-        lambda f: jax.jit(f),
-        lambda f: jax.jit(jax.grad(total(f), (0, 1))),
-        lambda f: jax.jit(jax.jacfwd(f, (0, 1))),
-        lambda f: jax.hessian(total(f), (0, 1)),
-    ):
-        found, expected = (jax.tree.leaves(transform(g)(x, scale)) for g in (f, plain))
-        for a, b in zip(found, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * float(np.abs(b).max()) + 1e-6)
-    batch = jax.numpy.stack([x, 2 * x])
-    np.testing.assert_allclose(
-        jax.vmap(f, (0, None))(batch, scale), jax.vmap(plain, (0, None))(batch, scale), atol=1e-5
-    )
-    assert {name for name, _ in calls} == {"forward", "push", "pull"}
 
 
 def test_other_dtypes_are_left_to_its_specification(calls):
@@ -539,26 +504,3 @@ def test_points_of_views_are_projected_by_the_rows_of_each_and_put_in_place(targ
         (expected,) = to_numpy(projective_map(rows[b], points[n : n + 1]))
         expected = expected + [*places[b], 0]
         np.testing.assert_allclose(found[n], expected, rtol=1e-4, atol=1e-4)
-
-
-def test_their_derivatives_are_those_of_differences_to_second_order():
-    torch = pytest.importorskip("torch")
-    generator = torch.Generator().manual_seed(5)
-    rows = torch.randn((3, 4, 4), dtype=torch.float64, generator=generator)
-    rows[:, 2, 3] += 4
-    points = torch.randn((5, 3), dtype=torch.float64, generator=generator)
-    view = torch.tensor([1, 1, 1, 3, 3], dtype=torch.int32)
-    places = torch.tensor([[0, 0], [9, 9], [20, 10]], dtype=torch.float64)
-    given = rows.requires_grad_(True), points.requires_grad_(True)
-
-    def projected(r, p):
-        return projective_map_of_views(r, p, view, places)
-
-    assert torch.autograd.gradcheck(projected, given, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(projected, given)
-
-    def mapped(r, p):
-        return affine_map_of_views(r[:, :2, :], p, view)
-
-    assert torch.autograd.gradcheck(mapped, given, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(mapped, given)

@@ -179,24 +179,6 @@ def test_forward_mode_and_reverse_mode_agree():
     assert float(t.grad) == pytest.approx(by_forward, rel=1e-3)
 
 
-@pytest.mark.thorough
-def test_a_program_of_jax_draws_and_pushes_what_torch_does():
-    jax = pytest.importorskip("jax")
-
-    def arrays(ball):
-        return {name: jax.numpy.asarray(x, jax.numpy.float32) for name, x in ball.items()}
-
-    image, derivative = pushed(lambda t: drawn(both_moved(t), [PINK, SOLID]))
-
-    def scene(t):
-        return drawn(both_moved(t, arrays), [PINK, SOLID])
-
-    found, pushed_by_jax = jax.jvp(jax.jit(scene), (0.0,), (1.0,))
-    np.testing.assert_allclose(np.asarray(found), image, atol=1e-3)
-    difference = np.linalg.norm(np.asarray(pushed_by_jax) - derivative)
-    assert difference < 1e-2 * np.linalg.norm(derivative)
-
-
 class OfWholeImages(rts.Sampler):
     """Casts rays through centres of pixels alone."""
 

@@ -135,21 +135,6 @@ def test_outlines_shift_with_the_surface(name, way):
     assert abs(grown) < 0.02 * area
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("way", ["sdf", "lattice"])
-def test_a_program_of_jax_has_the_derivative_of_torch(way):
-    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
-    f, q, eye, _ = SHAPES["torus across"]
-    image = coverage(f, eye, way, layers=2)
-
-    def moment(q, shift, across):
-        return (image(q, shift) * across).sum()
-
-    given = [np.asarray(x, np.float32) for x in (q, [SHIFT] * 3, np.arange(SIZE[1]))]
-    expected = torch.func.grad(moment)(*map(torch.tensor, given))
-    np.testing.assert_allclose(jax.jit(jax.grad(moment))(*map(jax.numpy.asarray, given)), expected, rtol=1e-3)
-
-
 # -------------------------------------------------------------------------------------------------- deepest points
 
 
@@ -233,15 +218,3 @@ def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     for side in (0, 1):
         np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)
         assert (pairs[there, side, 2] > last[there, 2] - 1e-4).all()
-
-
-def test_views_together_have_the_gradients_of_views_alone():
-    torch = pytest.importorskip("torch")
-    f, q, _, _ = SHAPES["box, turned"]
-    surface, options = WAYS["lattice"](lambda theta, p: f(theta["q"], p))
-    cameras = [Camera.look_at(eye, (0, 0, 0), fov_y=45) for eye in ((1, 2, 3), (-2, 1, 3))]
-    part = lambda q: Part(surface, {"q": q}, "silhouette")  # noqa: E731
-    together = torch.func.jacrev(lambda q: rts.render_views(part(q), cameras, (32, 32))[..., 3].sum())
-    alone = torch.func.jacrev(lambda q: sum(rts.render(part(q), c, (32, 32))[..., 3].sum() for c in cameras))
-    q = torch.tensor(q)
-    np.testing.assert_allclose(together(q).numpy(), alone(q).numpy(), rtol=1e-4)

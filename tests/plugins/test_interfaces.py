@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from analytic import Ellipsoid
-from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosphere, mesh_part, quad, show, to_numpy
+from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosphere, mesh_part, quad, show
 
 import rts
 from rts import splatting
@@ -15,7 +15,6 @@ from rts.contracts.checks import check_shader
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_base import overrides, promised
-from rts.testing import SplatterConformance
 
 pytestmark = pytest.mark.core
 
@@ -372,48 +371,6 @@ def test_row_is_an_array_of_the_engine_of_the_positions(target):
     assert all(len(set(kinds)) == 1 and kinds[0] != "numpy" for kinds in seen) and len(seen) == 3
 
 
-class Gaussian5(rts.Splatter):
-    """A 5 × 5 Gaussian of fronts, as the guide to plugins writes it."""
-
-    reach, sigma = 2, 0.8
-
-    def __init__(self, calibrated=True):
-        self.gamma = rts.splatting.exact_calibration(self.sigma, self.reach) if calibrated else 1.0
-
-    def image(self, splats):
-        xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
-        row = splats.row[0]
-        if splats.rgba.shape[0] == 0:  # Nothing can be taken by index.
-            return xp.stack([xp.zeros_like(row, dtype=splats.rgba.dtype)] * 4, axis=-1)
-        height, width = row.shape
-        index = xp.reshape(xp.where(row >= 0, row, 0), (-1,))
-        position = xp.reshape(xp.take(splats.positions, index, axis=0), (height, width, 3))
-        rgba = xp.reshape(xp.take(splats.rgba, index, axis=0), (height, width, 4))
-        rgba = xp.where((row >= 0)[..., None], xp.concat([rgba, xp.ones_like(rgba[..., :1])], axis=-1), 0.0)
-        center = engine.constant(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5, position)
-        off = self.gamma * (position[..., :2] - center)
-        scale, offsets = 1 / (2 * self.sigma**2), range(-self.reach, self.reach + 1)
-        peak = 1.001 / sum(np.exp(-(u * u) * scale).item() for u in offsets) ** 2
-        total = 0.0
-        for u in offsets:
-            for v in offsets:
-                weight = peak * xp.exp(-((u - off[..., 0]) ** 2 + (v - off[..., 1]) ** 2) * scale)
-                total = total + _shifted(xp, weight[..., None] * rgba, u, v)
-        return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
-
-
-def _shifted(xp, image, u, v):
-    for axis, by in ((0, v), (1, u)):
-        if by:
-            at = (slice(None),) * axis
-            new, kept = (
-                xp.zeros_like(image[(*at, slice(None, abs(by)))]),
-                slice(None, -by) if by > 0 else slice(-by, None),
-            )
-            image = xp.concat([new, image[(*at, kept)]] if by > 0 else [image[(*at, kept)], new], axis=axis)
-    return image
-
-
 @pytest.mark.parametrize("sigma, reach", [(0.5, 1), (0.7, 1), (0.8, 2), (1.5, 3)])
 def test_the_calibration_of_any_gaussian_is_that_of_its_first_moment(sigma, reach):
     u = np.arange(-reach, reach + 1)
@@ -421,46 +378,6 @@ def test_the_calibration_of_any_gaussian_is_that_of_its_first_moment(sigma, reac
     # The derivative of the weights when the splat moves has the first moment Σ u² w / σ², of weights that sum to one.
     moment = (u**2 * weights).sum() / weights.sum() / sigma**2
     assert rts.splatting.exact_calibration(sigma, reach) == pytest.approx(1 / moment, rel=1e-12)
-
-
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_a_ramp_that_moves_under_a_stranger_s_gaussian_has_its_true_derivative(calibrated):
-    height, width = 9, 15
-    y, x = np.mgrid[:height, :width] + 0.5
-    positions = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
-    ramp = 0.2 + 0.04 * positions[:, :1]
-    rgba = np.concatenate([ramp, ramp, ramp, np.ones_like(ramp)], axis=1)
-    row = np.arange(height * width, dtype=np.int32).reshape(1, height, width)
-    target = DIFFERENTIABLE[0]
-    given, cells, weights = arrays(
-        target, (positions, row, np.eye(height * width)[4 * width + 7].reshape(height, width))
-    )
-    splatter = Gaussian5(calibrated)
-    value = lambda p: (splatter.splat(p, arrays(target, rgba), cells)[..., 0] * weights).sum()  # noqa: E731
-    slope = gradient(target, value, given)[:, 0].sum()
-    expected = -0.04 * (1.0 if calibrated else 1 / rts.splatting.exact_calibration(0.8, 2))
-    assert slope == pytest.approx(expected, rel=2e-3)
-
-
-def test_a_stranger_s_gaussian_gives_silhouettes_a_gradient():
-    target = DIFFERENTIABLE[0]
-    part = mesh_part(icosphere(1))
-
-    def seen(move):
-        xp = rts.namespace(move)
-        zero, one = xp.zeros_like(move[0]), xp.ones_like(move[0])
-        rows = [
-            [one, zero, zero, move[0]],
-            [zero, one, zero, move[1]],
-            [zero, zero, one, zero],
-            [zero, zero, zero, one],
-        ]
-        transform = xp.stack([xp.stack(r) for r in rows])
-        image = rts.render(part.replace(transform=transform), CAMERA, SIZE, splatter=Gaussian5())
-        return image[:, 16:, 3].sum()
-
-    assert gradient(target, seen, arrays(target, np.zeros(2)))[0] > 1
-    assert np.isfinite(to_numpy(rts.render(part, CAMERA, SIZE, splatter=Gaussian5()))).all()
 
 
 # ------------------------------------------------------------------------------------------------- what is sampled
@@ -515,12 +432,6 @@ def test_a_plugin_of_another_kind_is_refused():
         show(part, splatter=RASTER())
     with pytest.raises(rts.InputError, match="the sampler is .*rts.Sampler"):
         show(part, sampler=splatting.Plain())
-
-
-class TestGaussian5(SplatterConformance):
-    @pytest.fixture
-    def splatter(self):
-        return Gaussian5()
 
 
 def test_a_subclass_of_a_splatter_may_have_an_image_of_its_own():

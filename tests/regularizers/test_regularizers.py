@@ -233,13 +233,6 @@ def test_gradients_are_those_of_finite_differences(energy):
 
 
 @every_energy
-def test_torch_checks_the_gradient(energy):
-    torch = pytest.importorskip("torch")
-    x = torch.tensor(BENT, requires_grad=True)
-    assert torch.autograd.gradcheck(energy, [x], check_forward_ad=True, fast_mode=True)
-
-
-@every_energy
 def test_compiled_and_in_batches_it_is_what_it_is_alone(energy):
     jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
     batch = np.stack([BENT, VERTICES @ np.diag([1, 2, 3.0])])

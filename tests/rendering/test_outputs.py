@@ -164,16 +164,6 @@ def test_uv_is_zero_on_parts_without():
     np.testing.assert_allclose(found[5, -1], 0, atol=1e-6)
 
 
-@pytest.mark.thorough
-def test_outputs_inside_of_jit_are_those_outside():
-    jax = pytest.importorskip("jax")
-    part, camera = arrays("jax", mesh_part(icosphere(1))), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
-    names = ("color", "depth", "depth_front", "part", "triangle")
-    found = jax.jit(lambda p: rts.render(p, camera, (16, 16), outputs=names))(part)
-    for name, expected in rts.render(part, camera, (16, 16), outputs=names).items():
-        np.testing.assert_allclose(found[name], expected, atol=1e-5)
-
-
 # ------------------------------------------------------------------------------------------------ residuals
 
 

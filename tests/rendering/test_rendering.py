@@ -521,16 +521,6 @@ def test_plain_rasterization_has_a_gradient_of_zero(target):
     assert found.shape == BOX[0].shape and (found == 0).all()
 
 
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_the_background_may_be_what_is_differentiated(target):
-    def loss(background):
-        return rts.render(PART, CAMERA, SIZE, background=background).sum()
-
-    found = gradient(target, loss, arrays(target, np.array([0.1, 0.2, 0.3])))
-    alpha = rts.render(PART, CAMERA, SIZE)[..., 3]
-    np.testing.assert_allclose(found, np.full(3, (1 - alpha).sum()), rtol=1e-4)
-
-
 def test_a_scene_far_away_or_huge_is_no_singular_camera():
     for scale in (1e-20, 1e8):
         camera = Camera.look_at(np.array([0.1, 0.3, 3]) * scale, (0, 0, 0), fov_y=40)

@@ -70,19 +70,6 @@ def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
         np.testing.assert_allclose(banded, whole, rtol=1e-3, atol=1e-3)
 
 
-def test_bands_work_under_jit_and_torch_func(narrow_bands):
-    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
-
-    def loss(v):
-        return (image(v, 3)[..., :3] ** 2).sum()
-
-    expected = gradient("torch-cpu", loss, arrays("torch-cpu", CORNERS))
-    by_func = torch.func.grad(loss)(arrays("torch-cpu", CORNERS)).numpy()
-    by_jit = np.asarray(jax.jit(jax.grad(loss))(arrays("jax", CORNERS)))
-    np.testing.assert_allclose(by_func, expected, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(by_jit, expected, rtol=1e-3, atol=1e-3)
-
-
 def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
     calls = []
 
@@ -177,13 +164,6 @@ def test_a_background_has_its_gradient_over_bands_of_constants(target, narrow_ba
     found = gradient(target, lambda b: image(CORNERS, 3, background=b).sum(), background)
     alpha = image(CORNERS, 3)[..., 3:]
     np.testing.assert_allclose(found, np.broadcast_to(1 - alpha, found.shape), atol=1e-5)
-
-
-def test_prepared_parts_are_rendered_in_bands(narrow_bands):
-    part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
-    np.testing.assert_array_equal(
-        rts.render(rts.prepare(part), CAMERA, SIZE, supersample=3), rts.render(part, CAMERA, SIZE, supersample=3)
-    )
 
 
 def test_sampled_knows_its_samples_a_pixel():

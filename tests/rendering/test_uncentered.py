@@ -121,21 +121,6 @@ def test_alpha_inside_is_one_at_every_resolution():
         assert image[12:20, 12:20, 3].min() > 0.999
 
 
-def test_several_views_are_those_rendered_one_by_one():
-    torch = pytest.importorskip("torch")
-    cameras = [CAMERA, Camera.look_at((1, 2, 2), (0, 0, 0), fov_y=FOV)]
-
-    def found(render):
-        radius = torch.tensor(RADIUS, requires_grad=True)
-        images = render(Part(Ball(1), {"radius": radius}, "normals"))
-        return images.detach().numpy(), torch.autograd.grad((images**2).sum(), radius)[0].item()
-
-    images, gradient = found(lambda part: rts.render_views(part, cameras, SIZE))
-    expected, slope = found(lambda part: torch.stack([rts.render(part, camera, SIZE) for camera in cameras]))
-    np.testing.assert_allclose(images, expected, atol=1e-5)
-    assert gradient == pytest.approx(slope, rel=1e-4)
-
-
 @pytest.mark.parametrize("cull", ["none", "back"])
 @pytest.mark.parametrize("by", [(0, 0, 3), (0, 0, 10), (1e4, 0, 0)], ids=["at the camera", "behind it", "far away"])
 def test_samples_far_from_their_rays_have_finite_derivatives(by, cull):
@@ -152,19 +137,6 @@ def test_samples_far_from_their_rays_have_finite_derivatives(by, cull):
     image = rts.render(part, CAMERA, SIZE, supersample=2)
     (gradient,) = torch.autograd.grad(image[..., 3].mean(), radius)
     assert torch.isfinite(image).all() and gradient.item() == pytest.approx(closed_form()[1], rel=0.3)
-
-
-def test_programs_compiled_beforehand_find_the_same():
-    jax = pytest.importorskip("jax")
-    camera = CAMERA
-
-    def alpha(radius, **options):
-        part = Part(Ball(1), {"radius": radius}, "normals")
-        return rts.render(part, camera, (16, 16), **options)[..., 3].mean()
-
-    radius = jax.numpy.float32(RADIUS)
-    found = jax.jit(jax.value_and_grad(lambda r: alpha(r, capacity=900, layers=2)))(radius)
-    np.testing.assert_allclose(found, jax.value_and_grad(lambda r: alpha(r, layers=2))(radius), rtol=1e-4)
 
 
 def test_derivatives_are_not_called_unknown():

@@ -5,8 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
-from example_surfaces import Torus
 from helpers import ALL, DIFFERENTIABLE, arrays, gradient, to_numpy
+from second_plugin.torus import Torus
 
 import rts
 from rts import Camera, InputError, Part
@@ -203,7 +203,6 @@ def test_a_background_that_is_not_finite_is_refused(value, target):
 @pytest.mark.parametrize("sampler", ["raster", "rays"])
 @pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
 def test_nan_in_a_transform_is_called_that(target, sampler):
-    from example_surfaces import Torus
 
     part = (Torus.example() if sampler == "rays" else PART).replace(transform=arrays(target, np.full((4, 4), np.nan)))
     with pytest.raises(InputError, match="the transform of a part holds NaN"):

@@ -59,12 +59,6 @@ def test_two_layers_at_one_root_become_one_and_the_width_of_a_pixel_decides(view
         assert column(z, z + 1.2 * apart, camera=camera)[0] == [0, 1]
 
 
-def test_how_far_layers_are_apart_counts_from_the_one_that_stays():
-    spread = rays_spread(PLANES)
-    apart = 0.01 * (spread[0] + spread[1] * 3)
-    assert column(3, 3 + 0.6 * apart, 3 + 1.3 * apart, 3 + 1.9 * apart)[0] == [0, 2, -1, -1]
-
-
 def test_layers_before_the_near_and_beyond_the_far_plane_are_dropped():
     assert column(0.99, 4, 9.01, 2) == ([3, 1, -1, -1], [2, 4, 0, 0])
     assert column(-4, 1, 9)[0] == [1, 2, -1]
@@ -91,24 +85,6 @@ def test_settling_changes_rows_and_depths_only():
 
 
 # ------------------------------------------------------------------------------------------------ repack
-
-
-def test_rows_are_numbered_layer_by_layer_in_the_order_of_cells():
-    given = made([[[4, -1, 2]], [[0, 3, 1]]], np.ones((2, 1, 3)))
-    found = packing.repack(given, given.row >= 0, None)
-    np.testing.assert_array_equal(found.row, [[[0, -1, 1]], [[2, 3, 4]]])
-    np.testing.assert_array_equal(found.ids, given.ids[[4, 2, 0, 3, 1]])
-    np.testing.assert_array_equal(found.params, given.params[[4, 2, 0, 3, 1]])
-    assert found.overflow == 0
-
-
-def test_the_deepest_layers_have_no_room_first_and_are_counted():
-    given = made(np.arange(9).reshape(3, 1, 3), np.ones((3, 1, 3)))
-    found = packing.repack(replace(given, overflow=np.int32(5)), given.row >= 0, 4)
-    np.testing.assert_array_equal(found.row, [[[0, 1, 2]], [[3, -1, -1]], [[-1, -1, -1]]])
-    np.testing.assert_array_equal(found.depth, np.where(found.row >= 0, 1, 0))
-    assert found.overflow == 5 + 5 and found.overflow.dtype == np.int32 and found.overflow.shape == ()
-    assert len(found.ids) == len(found.params) == 4
 
 
 def test_tables_by_sample_go_with_their_samples_and_others_stay():

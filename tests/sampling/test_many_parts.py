@@ -5,7 +5,6 @@ from unittest import mock
 import numpy as np
 import pytest
 from helpers import CAMERA, TORCH, arrays, box, gradient, icosphere, relative_error, rigid, soup, to_numpy
-from mixed_scenes import mixed_of
 
 import rts
 from rts.sampling import joint
@@ -171,26 +170,6 @@ def test_parts_beside_a_surface_without_triangles_are_drawn_alone():
     assert not any(kinds_of([*parts(transforms), ball]))
 
 
-def test_triangles_are_told_where_they_are_asked_for_alone():
-    transforms, parts = crowd(3)
-    own = parts(transforms)
-    assert all(kinds_of(own, splatter=None))
-    assert rts.sample(own, CAMERA, SIZE, engine="torch", splatter=None).triangle is None
-
-
-def test_textured_and_plain_meshes_are_drawn_in_one_pass(singly):
-    _, parts = crowd(3, moved=False)
-    own, (vertices, faces) = parts(None), box(0.5)
-    uv = {
-        "vertices": vertices + 0.3,
-        "uv": vertices[:, :2].astype(np.float32),
-        "texture": np.random.default_rng(0).uniform(0, 0.9, (4, 4, 3)),
-    }
-    own.insert(1, rts.Part(rts.Mesh(faces), uv, "textured"))
-    assert all(kinds_of(own))
-    np.testing.assert_array_equal(image_of(own), singly(image_of, own))
-
-
 def test_passes_are_merged_by_depth_and_equal_depths_by_triangle():
     rng = np.random.default_rng(3)
     layers, size, passes, start = 3, (7, 9), [], 0
@@ -228,17 +207,6 @@ def test_a_number_of_rows_to_allot_is_that_of_each_part():
     assert not any(kinds_of(own, capacity=20_000))
 
 
-@pytest.mark.parametrize("number", range(0, 24, 3))
-def test_scenes_of_the_generator_are_bit_for_bit_as_one_part_at_a_time(singly, number):
-    mixed = mixed_of(number)  # Opaque and translucent parts, some of them culled.
-
-    def image():
-        options = {"layers": mixed.layers, "supersample": mixed.supersample, "engine": "torch"}
-        return to_numpy(rts.render(mixed.parts, mixed.cameras[0], mixed.size, **options))
-
-    np.testing.assert_array_equal(image(), singly(image))
-
-
 class ByCull(rts.Sampler):
     """Culled parts by "reference", others by "raster": two samplers in one scene."""
 
@@ -259,9 +227,3 @@ def test_two_samplers_of_one_scene_share_no_pass(singly):
     own, sampler = [*parts(None), *culled(None)], ByCull()
     assert kinds_of(own, sampler=sampler) == [True] * 4 + [False] * 3
     np.testing.assert_array_equal(image_of(own, sampler=sampler), singly(lambda: image_of(own, sampler=sampler)))
-
-
-def test_curved_surfaces_beside_meshes_are_bit_for_bit_as_one_at_a_time(singly):
-    _, parts = crowd(4, moved=False)
-    own = [*parts(None), rts.plugin("surfaces", "bezier").example().replace(shader="lambert")]
-    np.testing.assert_array_equal(image_of(own), singly(image_of, own))

@@ -6,7 +6,7 @@ from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 
 import rts
 from rts import Camera, GBuffer, Part
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import engine_of
 from rts.contracts.records import ArraySpec, Cells
 from rts.plugin_api.records import Fragments, Proxy, Samples
 from rts.sampling.merging import merge
@@ -94,50 +94,11 @@ def test_refinement_and_tables_work_on_every_engine(target):
         np.testing.assert_allclose(traced(part.theta["radius"]), reference, atol=1e-4)
 
 
-def test_lift_numbers_samples_layer_by_layer_and_interpolates_corner_parameters():
-    ids = np.array([[[0, -1], [1, 0]], [[1, -1], [-1, -1]]], np.int32)
-    barycentrics = np.tile(np.array([0.5, 0.25], np.float32), (2, 2, 2, 1))
-    depth = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
-    faces = np.array([[0, 1, 2], [2, 1, 3]], np.int32)
-    corners = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
-    samples = pack_fragments(Fragments(ids, barycentrics, depth), Proxy(np.zeros((4, 3)), faces, None, corners))
-    np.testing.assert_array_equal(samples.row, [[[0, -1], [1, 2]], [[3, -1], [-1, -1]]])
-    np.testing.assert_array_equal(samples.ids, faces[[0, 1, 0, 1]])
-    weights = np.array([0.5, 0.25, 0.25])
-    np.testing.assert_allclose(samples.params, np.einsum("c,ncp->np", weights, corners[[0, 1, 0, 1]]))
-    np.testing.assert_array_equal(samples.depth, np.where(ids >= 0, depth, 0))
-
-
-def test_lift_drops_the_deepest_layers_first_where_capacity_ends():
-    ids = np.zeros((2, 1, 3), np.int32)
-    fragments = Fragments(ids, np.zeros((2, 1, 3, 2), np.float32), np.ones((2, 1, 3), np.float32))
-    samples = pack_fragments(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)), capacity=4)
-    np.testing.assert_array_equal(samples.row, [[[0, 1, 2]], [[3, -1, -1]]])
-    assert samples.overflow == 2 and len(samples.ids) == 4
-
-
 def test_there_is_a_row_even_where_nothing_is_hit():
     ids = np.full((1, 2, 2), -1, np.int32)
     fragments = Fragments(ids, np.zeros((1, 2, 2, 2), np.float32), np.zeros((1, 2, 2), np.float32))
     samples = pack_fragments(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)))
     assert len(samples.ids) == 1 and (samples.row == -1).all()
-
-
-@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
-def test_layers_of_several_parts_are_interleaved_by_depth_and_ties_go_to_the_earlier(target):
-    def samples(row, depth):
-        row, depth = np.array(row, np.int32).reshape(2, 1, 3), np.array(depth, np.float32).reshape(2, 1, 3)
-        fields = np.zeros((4, 1), np.int32), np.zeros((4, 2), np.float32), Cells(row, depth), np.int32(0)
-        return Samples(*fields) if target == "numpy" else Samples(*arrays(target, fields))
-
-    first = samples([0, 1, -1, 2, -1, -1], [1, 5, 0, 3, 0, 0])
-    second = samples([0, 1, 2, 3, -1, -1], [2, 5, 7, 4, 0, 0])
-    merged = merge([first, second], 2)
-    np.testing.assert_array_equal(to_numpy(merged.row).reshape(2, 3), [[0, 1, 6], [4, 5, -1]])
-    np.testing.assert_array_equal(to_numpy(merged.part).reshape(2, 3), [[0, 0, 1], [1, 1, -1]])
-    depth = np.where(to_numpy(merged.row) >= 0, to_numpy(merged.depth), 0)
-    np.testing.assert_array_equal(depth.reshape(2, 3), [[1, 5, 7], [2, 5, 0]])
-    assert namespace(merged.row) is namespace(first.row)
 
 
 @pytest.mark.parametrize(

@@ -56,13 +56,6 @@ def test_tangents_move_with_the_part_and_a_mirror_changes_their_sign():
     np.testing.assert_allclose(seen(UV, transform=np.diag([-1.0, 1, 1, 1])), [-1, 0, 0, -1], atol=1e-5)
 
 
-def test_views_together_have_the_tangents_of_each():
-    part = mesh_part(quad(-1, 1, -1, 1), theta={"uv": UV}, shader=tangent_of)
-    views = rts.render_views(part, [FRONT, EYE], SIZE, splatter="none")
-    for view, camera in zip(views, (FRONT, EYE), strict=True):
-        np.testing.assert_allclose(view, rts.render(part, camera, SIZE, splatter="none"), atol=1e-6)
-
-
 def test_tangents_of_curved_surfaces_are_their_derivatives():
     # A quarter of a cylinder about y: u runs around it, so tangents are at right angles to normal and axis.
     k = 0.5522847498

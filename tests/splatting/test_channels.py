@@ -107,13 +107,6 @@ def test_gradients_are_the_sum_of_those_of_each_three(target):
         np.testing.assert_allclose(found[name], expected[name], atol=2e-5 * np.abs(expected[name]).max())
 
 
-def test_compiled_by_jax_it_is_the_same():
-    jax = pytest.importorskip("jax")
-    parts, camera = arrays("jax", (scene(0, 7), CAMERA))
-    found = jax.jit(lambda theta: rts.render([parts[0].replace(theta=theta), parts[1]], camera, SIZE))(parts[0].theta)
-    np.testing.assert_allclose(np.asarray(found), show(scene(0, 7)), atol=2e-5)
-
-
 def test_features_are_fitted_to_an_image_of_theirs():
     target = show(scene(0, 5)[0])
     part = arrays("torch-cpu", scene(0, 5)[0])

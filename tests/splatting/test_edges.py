@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from cards import SIZE, SQUARE, TWO, card, covered, flat, in_pixels, turned, two_colors
+from cards import SIZE, SQUARE, TWO, card, covered, flat, in_pixels, turned
 from helpers import pushed
 
 import rts
@@ -150,33 +150,6 @@ def test_parts_beside_one_another_are_drawn_as_each_alone():
     np.testing.assert_allclose(edges(parts), alone[0] + alone[1], atol=1e-6)
 
 
-def test_numpy_draws_what_torch_draws():
-    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
-    drawn = edges(card(torch.as_tensor(corners)))
-    np.testing.assert_allclose(edges(card(corners)), drawn.numpy(), atol=1e-5)
-
-
-def test_torch_func_draws_and_pushes_what_forward_mode_does():
-    def image(t):
-        along = torch.zeros(4, 4)
-        along[0, 3] = 1.0
-        front, back = two_colors()
-        return edges([front.replace(transform=torch.eye(4) + t * along), back])
-
-    value, derivative = pushed(image)
-    by_func = torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))
-    np.testing.assert_allclose(by_func[0].numpy(), value, atol=1e-6)
-    np.testing.assert_allclose(by_func[1].numpy(), derivative, atol=1e-5)
-
-
-@pytest.mark.thorough
-def test_jax_draws_what_numpy_draws():
-    jax = pytest.importorskip("jax")
-    drawn = edges([part.replace(theta={**part.theta, "vertices": jax.numpy.asarray(part.theta["vertices"])})
-                   for part in two_colors()])  # fmt: skip
-    np.testing.assert_allclose(np.asarray(drawn), edges(two_colors()), atol=1e-5)
-
-
 @pytest.mark.filterwarnings("ignore:second derivatives")
 def test_the_area_of_a_square_that_shifts_has_no_curvature():
     """d² of a pixel's area is 0 but where a corner turns: at most 0.02 px⁻² for each pixel of perimeter."""
@@ -201,14 +174,6 @@ def test_supersampling_keeps_the_area():
     corners = turned(SQUARE, 0.3, (12.2, 11.7))
     image = edges(card(flat(corners)), supersample=3)
     np.testing.assert_allclose(image[..., 3], covered(corners, SIZE), atol=2e-4)
-
-
-def test_prepared_parts_and_samples_are_drawn_alike():
-    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
-    whole = edges(card(corners))
-    np.testing.assert_array_equal(edges(rts.prepare(card(corners), "raster")), whole)
-    sampled = rts.sample(card(corners), in_pixels(), SIZE, splatter="edges")
-    np.testing.assert_array_equal(rts.render_samples(sampled, card(corners), in_pixels(), splatter="edges"), whole)
 
 
 def test_two_layers_ask_for_no_second_sample():

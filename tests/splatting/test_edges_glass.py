@@ -223,39 +223,6 @@ def test_glass_that_lets_no_light_through_is_drawn_as_opaque():
     assert np.linalg.norm(pushed_glass - derivative) < 0.15 * np.linalg.norm(derivative)
 
 
-def mixed(t):
-    """Panes, a ball of glass and cards, some of which cross."""
-    corners = turned(SQUARE, 0.3, (14.2, 11.7))
-    ramp = np.random.default_rng(2).random((4, 3))
-    slope = 0.3 * (corners[:, 0] - 12.2)
-    parts = [glass_ball(t, (1.0, 0.2, 0.3)), pane(corners, 20.5 + slope, ramp, 0.7, t, (0.3, -0.5, 0.4))]
-    return [*parts, pane(turned(SQUARE, -0.2, (9, 12)), 20 - slope, ramp[::-1], 0.4), pane(EVERYWHERE, 40, ramp, 1.0)]
-
-
-def test_numpy_draws_what_torch_draws():
-    parts = mixed(torch.zeros(()))
-    known = [part.replace(theta={name: np.asarray(x) for name, x in part.theta.items()}) for part in parts]
-    np.testing.assert_allclose(drawn(known), drawn(parts).numpy(), atol=1e-5)
-
-
-@pytest.mark.thorough
-def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
-    jax = pytest.importorskip("jax")
-
-    def scene(shift):
-        parts = mixed(torch.zeros(()))
-        parts = [p.replace(theta={k: jax.numpy.asarray(np.asarray(x)) for k, x in p.theta.items()}) for p in parts]
-        ball = parts[0]
-        vertices = ball.theta["vertices"] + shift * jax.numpy.asarray([1.0, 0.2, 0.3])
-        return drawn([ball.replace(theta={**ball.theta, "vertices": vertices}), *parts[1:]], layers=6)
-
-    image, derivative = pushed(lambda t: drawn([mixed(t)[0], *mixed(0.0)[1:]], layers=6))
-    for f in (scene, jax.jit(scene)):
-        found, pushed_by_jax = jax.jvp(f, (0.0,), (1.0,))
-        np.testing.assert_allclose(np.asarray(found), image, atol=1e-4)
-        np.testing.assert_allclose(np.asarray(pushed_by_jax), derivative, atol=1e-3)
-
-
 @pytest.mark.parametrize("sampler", ["raster", "reference"])
 def test_what_lies_behind_opaque_parts_is_left_out(sampler):
     """A wall between panes covers the left half of the image; the reference samples part by part."""

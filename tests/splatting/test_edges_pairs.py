@@ -80,9 +80,6 @@ def hexagonal(shader):
     return loss, torch.zeros(3, dtype=torch.float64)
 
 
-UNITS = torch.eye(3, dtype=torch.float64)
-
-
 def reversed_twice(loss, at):
     """The Hessian of a loss, by reverse mode twice, without torch.func."""
     at = at.clone().requires_grad_()

@@ -160,14 +160,6 @@ def test_second_derivatives_of_jax_warn_as_they_are_traced(way):
         jax.eval_shape(ways[way], arrays("jax", START))
 
 
-@pytest.mark.thorough
-def test_second_derivatives_of_jax_warn_and_lack_the_curvature_of_outlines():
-    jax = pytest.importorskip("jax")
-    with pytest.warns(rts.errors.InputWarning, match="second derivatives"):
-        found = jax.jit(jax.hessian(area))(arrays("jax", START))
-    assert abs(float(found[0, 0])) < 0.5 * 2 * np.pi
-
-
 @pytest.mark.parametrize("way", quick(["grad", "batch", "forward", "Gauss-Newton", "linear", "grey"], 0))
 def test_first_derivatives_of_jax_do_not_warn(way):
     jax = pytest.importorskip("jax")

@@ -115,26 +115,6 @@ def test_multi_is_the_loop_written_from_the_definition(target, layers, middle_ho
         np.testing.assert_allclose(found, splat_by_loops(*scene), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("sigma, epsilon, calibration", [(0.3, 0.0, 1.0), (0.8, 0.2, 0.7)])
-def test_multi_takes_the_settings_of_the_definition(sigma, epsilon, calibration):
-    scene = random_scene(2)
-    found = Multi(sigma, epsilon, calibration).splat(*scene)
-    expected = splat_by_loops(*scene, sigma, epsilon, calibration)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("target", PLAIN)
-def test_single_is_multi_with_one_layer(target):
-    scene = arrays(target, random_scene(1))
-    found, expected = to_numpy((Single().splat(*scene), Multi().splat(*scene)))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
-
-
-def test_single_ignores_the_hidden_layers():
-    positions, rgba, row = random_scene(3)
-    np.testing.assert_array_equal(Single().splat(positions, rgba, row), Single().splat(positions, rgba, row[:1]))
-
-
 @pytest.mark.parametrize("target", TORCH)
 def test_gradients_are_the_finite_differences_of_the_loop(target):
     positions, rgba, row = random_scene(2, 3, 4)
@@ -238,15 +218,6 @@ def test_a_translating_ramp_is_felt_at_the_first_moment_of_the_kernel(name, targ
 
 @pytest.mark.parametrize("target", PLAIN)
 @pytest.mark.parametrize("name", KERNELS)
-def test_a_flat_interior_stays_as_it_is(name, target):
-    positions, row = dense(8, 9, layers=2)
-    color = np.array([0.1, 0.3, 0.2, 0.6])
-    image = to_numpy(KERNELS[name]().splat(*arrays(target, (positions, white(positions) * color, row))))
-    np.testing.assert_allclose(image[1:-1, 1:-1], np.broadcast_to(color, (6, 7, 4)), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("target", PLAIN)
-@pytest.mark.parametrize("name", KERNELS)
 def test_cells_outside_the_array_emit_nothing(name, target):
     positions, row = dense(5, 6)
     image = to_numpy(KERNELS[name]().splat(*arrays(target, (positions, white(positions), row))))
@@ -255,25 +226,6 @@ def test_cells_outside_the_array_emit_nothing(name, target):
     np.testing.assert_allclose(image[1:-1, -1], side, atol=1e-6)
     corner = 1.05 * ((1 + E2) / (1 + 2 * E2)) ** 2
     np.testing.assert_allclose(image[[0, 0, -1, -1], [0, -1, 0, -1]], corner, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_one_splat_is_the_kernel(name):
-    positions, row = np.array([(2.5, 1.5, 3.0)]), np.full((1, 4, 5), -1, np.int32)
-    row[0, 1, 2] = 0
-    image = KERNELS[name]().splat(positions, np.array([[0.2, 0.4, 0.6, 0.8]]), row)
-    weights = np.zeros((4, 5))
-    weights[0:3, 1:4] = 1.05 * np.outer((E2, 1, E2), (E2, 1, E2)) / (1 + 2 * E2) ** 2
-    np.testing.assert_allclose(image, weights[..., None] * (0.2, 0.4, 0.6, 0.8), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_a_splat_reaches_the_neighbours_of_its_cell_wherever_it_lies(name):
-    row = np.full((1, 5, 7), -1, np.int32)
-    row[0, 2, 2] = 0
-    image = KERNELS[name](sigma=2.0).splat(np.array([(4.4, 2.5, 3.0)]), np.ones((1, 4)), row)
-    assert set(map(tuple, np.argwhere(image[..., 3] > 0))) == {(y, x) for y in (1, 2, 3) for x in (1, 2, 3)}
-    assert image[2, 3, 3] > image[2, 2, 3] > image[2, 1, 3]
 
 
 # ------------------------------------------------------------------------------------------------ robustness

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from example_surfaces import Bezier
-from helpers import DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
-from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, rays_spread, stages
+from helpers import DIFFERENTIABLE, FRONT, arrays, gradient
+from seen import CAMERA, SIZE, VIEWS, WEIGHTS, rays_spread, stages
 
 import rts
 from rts.testing import SurfaceConformance
@@ -78,16 +78,6 @@ def test_coarse_and_fine_triangles_lead_to_the_same_roots():
     assert same.mean() > 0.95
 
 
-@pytest.fixture(scope="module")
-def slopes_by_torch():
-    """Values and gradients of the Bézier scene and of another one, in control points."""
-    pytest.importorskip("torch")
-    values = [BEZIER.theta["points"], 0.9 * BEZIER.theta["points"]]
-    loss = loss_of(BEZIER, "points", layers=3)
-    given = [arrays("torch-cpu", v) for v in values]
-    return values, [float(loss(x)) for x in given], [gradient("torch-cpu", loss, x) for x in given]
-
-
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_gradients_at_frozen_samples_are_finite_differences(target):
     # Of frozen samples the image has no derivative but theirs.
@@ -104,43 +94,6 @@ def test_gradients_at_frozen_samples_are_finite_differences(target):
         (along,) = directions([points], seed)
         ends = [loss(points + step * along) for step in (1e-6, -1e-6)]
         claim_slope(slope, along, (ends[0] - ends[1]) / 2e-6, f"the derivative of the image, in {target},")
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_images_of_patches_agree(target):
-    expected = rts.render(BEZIER, CAMERA, SIZE, layers=3)
-    found = rts.render(BEZIER.replace(theta=arrays(target, BEZIER.theta)), CAMERA, SIZE, layers=3)
-    # Where engines round differently, a break may lie a step of the search, 2⁻¹⁴ of a cell, farther on.
-    np.testing.assert_allclose(to_numpy(found), expected, rtol=0, atol=2**-14)
-
-
-def test_gradients_of_patches_agree_in_torch_and_jax(slopes_by_torch):
-    jax = pytest.importorskip("jax")
-    values, _, expected = slopes_by_torch
-    close(jax.grad(loss_of(BEZIER, "points", layers=3))(jax.numpy.asarray(values[0])), expected[0])
-
-
-def test_compiled_and_batched_by_jax_images_and_gradients_of_patches_are_the_same(slopes_by_torch):
-    jax = pytest.importorskip("jax")
-    values, losses, expected = slopes_by_torch
-    slope = jax.value_and_grad(loss_of(BEZIER, "points", layers=3))
-    found = jax.jit(slope)(jax.numpy.asarray(values[0]))
-    np.testing.assert_allclose(found[0], losses[0], rtol=1e-4)
-    close(found[1], expected[0])
-    found = jax.jit(jax.vmap(slope))(jax.numpy.stack(values))
-    np.testing.assert_allclose(found[0], losses, rtol=1e-4)
-    for one, other in zip(found[1], expected, strict=True):
-        close(one, other)
-
-
-def test_batched_by_torch_images_and_gradients_of_patches_are_the_same(slopes_by_torch):
-    torch = pytest.importorskip("torch")
-    values, losses, expected = slopes_by_torch
-    slope = torch.func.vmap(torch.func.grad_and_value(loss_of(BEZIER, "points", layers=3)))
-    found = slope(torch.tensor(np.stack(values)))
-    np.testing.assert_allclose(found[1], losses, rtol=1e-4)
-    for one, other in zip(found[0], expected, strict=True):
-        close(one, other)
 
 
 # --------------------------------------------------------------------------------------------- conformance

@@ -97,25 +97,6 @@ def test_motion_along_edges_keeps_corners_on_their_edges():
     np.testing.assert_allclose(after, expected, atol=2e-6)
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_engines_agree_on_image_and_gradient(motion):
-    part = grid(count=21, shader="normals", motion=motion, near_singular="keep")
-    weights = np.random.default_rng(0).random((*SIZE, 4)).astype(np.float32)
-    found = {}
-    for target in DIFFERENTIABLE:
-
-        def loss(values):
-            image = rts.render(part.replace(theta={"values": values}), CAMERA, SIZE)
-            return (image * rts.engine_of(image).constant(weights, image)).sum()
-
-        values = arrays(target, part.theta["values"])
-        found[target] = to_numpy(loss(values)), gradient(target, loss, values)
-    expected = found[DIFFERENTIABLE[0]]
-    for value, slope in found.values():
-        assert value == pytest.approx(float(expected[0]), rel=1e-5)
-        assert relative_error(slope, expected[1]) < 1e-3
-
-
 # ------------------------------------------------------------------------------------------------- silhouettes
 
 

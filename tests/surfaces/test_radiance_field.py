@@ -301,22 +301,6 @@ def compared(a, b, tolerance):
             assert np.abs(y).max() > 0 and relative_error(x, y) < tolerance, place
 
 
-def test_engines_agree_on_images_and_gradients():
-    expected = rts.render(surface(), CAMERA, SIZE)
-    gradients = []
-    for target in DIFFERENTIABLE:
-        part = surface(target, 300)
-        factor = arrays(target, np.random.default_rng(5).standard_normal((*SIZE, 4)))
-        np.testing.assert_allclose(to_numpy(rts.render(part, CAMERA, SIZE)), expected, atol=1e-4)
-
-        def loss(weights, part=part, factor=factor):
-            return (rts.render(part.replace(theta={**part.theta, "weights": weights}), CAMERA, SIZE) * factor).sum()
-
-        gradients.append(gradient(target, loss, part.theta["weights"]))
-    for found in gradients[1:]:
-        compared(found, gradients[0], 1e-3)
-
-
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_gradients_in_chunks_are_those_of_the_whole(target):
     factor = np.random.default_rng(5).standard_normal((len(POINTS), 4))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, quick, to_numpy
-from test_torus import RADII, closed_form, some_rays
+from quartic import RADII, closed_form, some_rays
 
 import rts
 from rts.plugin_api.records import Samples
@@ -149,28 +149,6 @@ def test_the_derivative_of_a_balls_area_in_its_radius_is_the_closed_form(supersa
     ends = [image_area(CAMERA, size, center, 0.8 + step) for step in (1e-5, -1e-5)]
     assert float(alpha) == pytest.approx(image_area(CAMERA, size, center, 0.8), rel=5e-3)
     assert float(radius.grad) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=0.03)
-
-
-@pytest.mark.thorough
-def test_images_and_derivatives_agree_between_engines():
-    torch, jax = pytest.importorskip("torch"), pytest.importorskip("jax")
-    weights = np.random.default_rng(0).normal(size=(24, 24, 4)).astype(np.float32)
-
-    def loss(radii):
-        part = rts.Part(TORUS, {"radii": radii}, "normals")
-        return (rts.render(part, CAMERA, (24, 24), layers=2) * rts.engine_of(radii).constant(weights)).sum()
-
-    radii = RADII.astype(np.float32)
-    reverse, compiled, batched = (
-        gradient("torch-cpu", loss, torch.tensor(radii)),
-        jax.jit(jax.grad(loss))(jax.numpy.asarray(radii)),
-        torch.func.vmap(torch.func.grad(loss))(torch.tensor(np.stack([radii, radii])))[1],
-    )
-    _, along = torch.func.jvp(loss, (torch.tensor(radii),), (torch.tensor([0.3, -0.7]),))
-    scale = float(np.abs(reverse).max())
-    np.testing.assert_allclose(compiled, reverse, atol=1e-3 * scale)
-    np.testing.assert_allclose(batched, reverse, atol=1e-3 * scale)
-    assert float(along) == pytest.approx(reverse @ [0.3, -0.7], abs=1e-3 * scale)
 
 
 # --------------------------------------------------------------------------------------------------- networks

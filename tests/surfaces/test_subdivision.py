@@ -218,25 +218,6 @@ def test_gradients_are_the_weights(target, name):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_compiled_gradients_of_images_are_those_of_numpy_and_torch():
-    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
-    part = Subdivision.example()
-
-    def loss(vertices):
-        image = rts.render(part.replace(theta={**part.theta, "vertices": vertices}), CAMERA, SIZE)
-        return (image[..., :3] ** 2).mean()
-
-    given = part.theta["vertices"]
-    compiled = np.asarray(jax.jit(jax.grad(loss))(jax.numpy.asarray(given)))
-    variable = torch.tensor(given, requires_grad=True)
-    loss(variable).backward()
-    assert np.abs(compiled).max() > 1e-3
-    np.testing.assert_allclose(compiled, variable.grad.numpy(), atol=1e-3 * np.abs(compiled).max())
-    along = np.random.default_rng(0).normal(size=given.shape).astype(np.float32)
-    _, forward = jax.jvp(jax.jit(loss), (jax.numpy.asarray(given),), (jax.numpy.asarray(along),))
-    np.testing.assert_allclose(float(forward), (compiled * along).sum(), rtol=1e-2, atol=1e-4)
-
-
 def test_a_face_varying_map_keeps_its_seam():
     # A tube of four sides whose map goes once around, from 0 to 1, with a seam along one edge.
     vertices, faces = prism(4)

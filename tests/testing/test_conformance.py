@@ -65,16 +65,17 @@ def ellipsoid(surface=None, shader="lambert"):
 # ------------------------------------------------------------------------------------------ what is built in
 
 
-class TestMesh(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return Mesh.example()
+def made(kit, **fixtures):
+    """A class of the kit for one plugin: its fixtures give these values, or what these functions and methods give."""
+
+    def fixture(given):
+        return pytest.fixture(lambda self: given() if inspect.isroutine(given) else given)
+
+    return type("Made", (kit,), {name: fixture(given) for name, given in fixtures.items()})
 
 
-class TestSkinned(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return rts.Skinned.example()
+TestMesh = made(SurfaceConformance, part=Mesh.example)
+TestSkinned = made(SurfaceConformance, part=rts.Skinned.example)
 
 
 @pytest.mark.thorough
@@ -91,28 +92,10 @@ class TestSkinnedNormals(SurfaceConformance):
         return bar.replace(surface=rts.Skinned(faces, bar.surface.joints, {"normals": table}), theta=theta)
 
 
-class TestBezier(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return Bezier.example()
-
-
-class TestBSpline(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return BSpline.example()
-
-
-class TestRevolution(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return rts.plugin("surfaces", "revolution").example()
-
-
-class TestSubdivision(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return subdivision().example()
+TestBezier = made(SurfaceConformance, part=Bezier.example)
+TestBSpline = made(SurfaceConformance, part=BSpline.example)
+TestRevolution = made(SurfaceConformance, part=lambda: rts.plugin("surfaces", "revolution").example())
+TestSubdivision = made(SurfaceConformance, part=lambda: subdivision().example())
 
 
 class TestSubdivisionOfPolygons(SurfaceConformance):
@@ -149,32 +132,10 @@ def subdivision():
         pytest.skip(str(error))
 
 
-class TestEllipsoid(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        return ellipsoid()
-
-    @pytest.fixture
-    def sampler(self):
-        return "rays"
-
-
-class TestRaster(SamplerConformance):
-    @pytest.fixture
-    def sampler(self):
-        return "raster"
-
-
-class TestReference(SamplerConformance):
-    @pytest.fixture
-    def sampler(self):
-        return "reference"
-
-
-class TestAuto(SamplerConformance):
-    @pytest.fixture
-    def sampler(self):
-        return "auto"
+TestEllipsoid = made(SurfaceConformance, part=ellipsoid, sampler="rays")
+TestRaster = made(SamplerConformance, sampler="raster")
+TestReference = made(SamplerConformance, sampler="reference")
+TestAuto = made(SamplerConformance, sampler="auto")
 
 
 class TestEmbree(SamplerConformance):
@@ -196,26 +157,13 @@ class TestOpenGL(SamplerConformance):
         return "opengl"
 
 
-class TestRays(SamplerConformance):
-    @pytest.fixture
-    def sampler(self):
-        return "rays"
-
-    @pytest.fixture
-    def parts(self):
-        return [ellipsoid(), ellipsoid().replace(transform=np.diag([1, 1.2, 0.8, 1]).astype(np.float32))]
-
-
-class TestNumpyEngine(EngineConformance):
-    @pytest.fixture
-    def engine(self):
-        return "numpy"
-
-
-class TestTorchEngine(EngineConformance):
-    @pytest.fixture
-    def engine(self):
-        return "torch"
+TestRays = made(
+    SamplerConformance,
+    sampler="rays",
+    parts=lambda: [ellipsoid(), ellipsoid().replace(transform=np.diag([1, 1.2, 0.8, 1]).astype(np.float32))],
+)
+TestNumpyEngine = made(EngineConformance, engine="numpy")
+TestTorchEngine = made(EngineConformance, engine="torch")
 
 
 class ShaderOfBuiltIn(ShaderConformance):
@@ -226,48 +174,16 @@ class ShaderOfBuiltIn(ShaderConformance):
         return {"color": np.array([0.9, 0.8, 1.0], np.float32)}
 
 
-class TestSilhouette(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return "silhouette"
-
-
-class TestNormals(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return "normals"
-
-
-class TestDepth(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return "depth"
-
-    @pytest.fixture
-    def theta(self):
-        return {"depth_range": np.array([1.5, 6.0], np.float32)}
-
-
-class TestUnlit(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return "unlit"
-
-
-class TestTranslucent(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return Unlit(opaque=False)
-
-
-class TestTextured(ShaderOfBuiltIn):
-    @pytest.fixture
-    def shader(self):
-        return "textured"
-
-    @pytest.fixture
-    def theta(self):
-        return {"texture": np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)}
+TestSilhouette = made(ShaderOfBuiltIn, shader="silhouette")
+TestNormals = made(ShaderOfBuiltIn, shader="normals")
+TestDepth = made(ShaderOfBuiltIn, shader="depth", theta=lambda: {"depth_range": np.array([1.5, 6.0], np.float32)})
+TestUnlit = made(ShaderOfBuiltIn, shader="unlit")
+TestTranslucent = made(ShaderOfBuiltIn, shader=Unlit(opaque=False))
+TestTextured = made(
+    ShaderOfBuiltIn,
+    shader="textured",
+    theta=lambda: {"texture": np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)},
+)
 
 
 class TestLambert(ShaderOfBuiltIn):
@@ -327,10 +243,7 @@ class TestTranslucentPbr(ShaderOfBuiltIn):
         return {name: np.array(value, np.float32) for name, value in numbers.items()}
 
 
-class TestBlinnPhong(TestLambert):
-    @pytest.fixture
-    def shader(self):
-        return "blinn_phong"
+TestBlinnPhong = made(TestLambert, shader="blinn_phong")
 
 
 class TestNone(SplatterConformance):
@@ -341,16 +254,8 @@ class TestNone(SplatterConformance):
         return "none"
 
 
-class TestSingle(SplatterConformance):
-    @pytest.fixture
-    def splatter(self):
-        return "single"
-
-
-class TestMulti(SplatterConformance):
-    @pytest.fixture
-    def splatter(self):
-        return "multi"
+TestSingle = made(SplatterConformance, splatter="single")
+TestMulti = made(SplatterConformance, splatter="multi")
 
 
 class TestEdges(SplatterConformance):
@@ -361,10 +266,7 @@ class TestEdges(SplatterConformance):
         return "edges"
 
 
-class TestEdgesAtCenters(TestEdges):
-    @pytest.fixture
-    def splatter(self):
-        return rts.plugin("splatters", "edges")(colors="centers")
+TestEdgesAtCenters = made(TestEdges, splatter=lambda: rts.plugin("splatters", "edges")(colors="centers"))
 
 
 # ---------------------------------------------------------------------------------------------- broken plugins

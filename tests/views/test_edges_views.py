@@ -146,53 +146,6 @@ def test_surfaces_that_are_sampled_view_by_view_share_a_splat(name):
     assert assert_same(name) == 1
 
 
-@pytest.mark.parametrize("name", ["three", "glass"])
-def test_float32_views_differ_by_the_rounding_of_places_in_the_picture(name):
-    assert assert_same(name, torch.float32, 5e-6, 1e-5) == 1
-
-
-@pytest.mark.parametrize("name", ["three", "glass"])
-def test_numpy_views_are_those_of_a_loop(name):
-    pose, splatter = POSE.astype(np.float32), Counted()
-    found, expected = views(name, pose, splatter), looped(name, pose)
-    assert splatter.calls == 1 and type(found) is np.ndarray
-    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
-
-
-@thorough
-@pytest.mark.parametrize("name", ["three", "glass", "plain"])
-def test_torch_func_sees_the_views_of_a_loop(name):
-    pose, splatter, way = torch.tensor(POSE), Counted(), torch.ones(6, dtype=torch.float64)
-    pushed = torch.func.jvp(lambda p: views(name, p, splatter), (pose,), (way,))
-    assert splatter.calls == (len(CAMERAS) if name == "plain" else 1)
-    for a, b in zip(pushed, torch.func.jvp(lambda p: looped(name, p), (pose,), (way,)), strict=True):
-        assert b.abs().max() > 0.1
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-11)
-    pulled = [torch.func.grad(lambda p, f=f: weighed(f(name, p)))(pose) for f in (views, looped)]
-    torch.testing.assert_close(*pulled, rtol=0, atol=1e-11 * float(pulled[1].abs().max()))
-
-
-@pytest.mark.parametrize("name", ["one", "glass"])
-def test_vmap_over_poses_is_a_loop_of_views(name):
-    poses = torch.tensor(np.stack([POSE, -POSE]))
-    together = torch.func.vmap(lambda p: views(name, p))(poses)
-    # Other cameras draw the triangles, and barycentrics are float32.
-    torch.testing.assert_close(together, torch.stack([views(name, p) for p in poses]), rtol=0, atol=1e-7)
-
-
-@thorough
-@pytest.mark.parametrize(("name", "compiled"), [("three", True), ("glass", False)])
-def test_jax_draws_and_pulls_the_views_of_torch(name, compiled):
-    jax = pytest.importorskip("jax")
-    expected, slopes = with_gradient(lambda p: views(name, p), torch.tensor(POSE))
-    pose, splatter, way = jax.numpy.asarray(POSE, "float32"), Counted(), jax.jit if compiled else (lambda f: f)
-    found = way(lambda p: views(name, p, splatter))(pose)
-    assert splatter.calls == 1
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
-    along = way(jax.grad(lambda p: weighed(views(name, p))))(pose)
-    np.testing.assert_allclose(along, slopes, rtol=0, atol=1e-4 * float(slopes.abs().max()))
-
-
 # ------------------------------------------------------------------------------------------ views in the picture
 
 
@@ -289,26 +242,3 @@ def test_views_that_see_nothing_lie_beside_others():
     for cameras in ([away, CAMERAS[0], away, CAMERAS[1]], [CAMERAS[0], away]):
         assert assert_same("three", cameras=cameras) == 1
     assert views("three", torch.tensor(POSE), cameras=[away, away]).abs().max() == 0
-
-
-def test_prepared_parts_and_constant_surfaces_have_views_of_a_loop():
-    parts = crossing()
-    expected = np.stack([rts.render(parts, camera, SIZE) for camera in CAMERAS])
-    # Surfaces are evaluated where they are sampled, beside cameras of torch.
-    seen = [camera.replace(view=torch.as_tensor(camera.view)) for camera in CAMERAS]
-    for found in (rts.render_views(rts.prepare(parts), CAMERAS, SIZE), rts.render_views(parts, seen, SIZE)):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
-
-
-def test_cameras_are_fitted_alike():
-    eyes = torch.tensor(np.array(EYES))
-
-    def images(eyes, together):
-        seen = [Camera.look_at(eye, torch.zeros(3, dtype=eyes.dtype), fov_y=40) for eye in eyes]
-        if together:
-            return rts.render_views(crossing(), seen, SIZE, splatter="edges")
-        return torch.stack([rts.render(crossing(), camera, SIZE, splatter="edges") for camera in seen])
-
-    (_, along), (_, slopes) = (with_gradient(lambda p, t=t: images(p, t), eyes) for t in (True, False))
-    assert (slopes.abs().amax(1) > 0.1).all()
-    torch.testing.assert_close(along, slopes, rtol=0, atol=1e-11 * float(slopes.abs().max()))

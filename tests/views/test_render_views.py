@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere, mesh_part, to_numpy
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, icosphere, mesh_part, to_numpy
 
 import rts
 from rts import Camera
@@ -134,47 +134,6 @@ def test_numpy_scenes_whose_shaders_hold_traced_arrays_are_differentiated():
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-2)
 
 
-def test_a_compiled_program_renders_views_and_takes_capacity():
-    jax = pytest.importorskip("jax")
-    part = mesh_part(icosphere(1), shader="normals")
-
-    def loss(vertices, capacity=None):
-        moved = part.replace(theta={"vertices": vertices})
-        return (rts.render_views(moved, CAMERAS, SIZE, capacity=capacity) * WEIGHTS).sum()
-
-    vertices = arrays("torch-cpu", part.theta["vertices"])
-    expected = gradient(
-        "torch-cpu",
-        lambda v: (
-            rts.render_views(part.replace(theta={"vertices": v}), CAMERAS, SIZE) * arrays("torch-cpu", WEIGHTS)
-        ).sum(),
-        vertices,
-    )
-    found = to_numpy(jax.jit(jax.grad(loss), static_argnums=1)(jax.numpy.asarray(part.theta["vertices"]), 700))
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("capacity", [None, 700])
-def test_compiled_silhouettes_are_those_of_a_loop(capacity):
-    """For one part of one colour jax samples and splats all views together."""
-    jax = pytest.importorskip("jax")
-    part, options = mesh_part(icosphere(1), shader="silhouette"), {"capacity": capacity}
-
-    def images(vertices, together):
-        moved = part.replace(theta={"vertices": vertices})
-        if together:
-            return rts.render_views(moved, CAMERAS, SIZE, **options)
-        return jax.numpy.stack([rts.render(moved, camera, SIZE, **options) for camera in CAMERAS])
-
-    vertices = jax.numpy.asarray(part.theta["vertices"])
-    found, expected = (
-        jax.jit(jax.value_and_grad(lambda v, t=t: (images(v, t) * WEIGHTS).sum()))(vertices) for t in (True, False)
-    )
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-4)
-    assert np.abs(expected[1]).max() > 0.5
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-4 * float(np.abs(expected[1]).max()))
-
-
 @pytest.mark.filterwarnings("ignore:.* samples find no room:rts.errors.InputWarning")
 def test_what_does_not_fit_is_left_out_of_its_own_view():
     jax = pytest.importorskip("jax")
@@ -188,19 +147,6 @@ def test_what_does_not_fit_is_left_out_of_its_own_view():
     whole = looped(part, cameras)
     assert 0.1 < found[0, ..., 3].sum() / whole[0, ..., 3].sum() < 0.9
     np.testing.assert_allclose(found[1:], whole[1:], atol=2e-5)
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_silhouettes_through_poses_cameras_and_batches_are_those_of_a_loop(target):
-    part = mesh_part(icosphere(1), shader="silhouette")
-    expected, part = looped(part), arrays(target, part)
-    stacked = arrays(target, Camera.stack([camera.for_size(SIZE) for camera in CAMERAS]))
-    np.testing.assert_allclose(to_numpy(rts.render_views(part, stacked, SIZE)), expected, atol=2e-5)
-
-    vertices = to_numpy(part.theta["vertices"])
-    several = arrays(target, np.stack([vertices, 0.7 * vertices]))
-    together = batched(target, lambda v: rts.render_views(part.replace(theta={"vertices": v}), stacked, SIZE))(several)
-    np.testing.assert_allclose(to_numpy(together)[0], expected, atol=2e-5)
 
 
 @pytest.mark.filterwarnings("ignore::rts.errors.InputWarning")  # A telephoto lens.
@@ -219,14 +165,6 @@ def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypa
     np.testing.assert_allclose(more[[0, 3, 4]], found[0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["isosurface", "sdf"])
-@pytest.mark.parametrize("target", ["numpy", *TORCH])
-def test_surfaces_that_refine_or_intersect_rays_are_rendered_as_by_a_loop(name, target):
-    part = arrays(target, rts.plugin("surfaces", name).example())
-    found = to_numpy(rts.render_views(part, CAMERAS, SIZE))
-    np.testing.assert_allclose(found, looped(part), atol=2e-5)
-
-
 def test_a_prepared_scene_and_samplers_that_take_views_in_turn():
     pytest.importorskip("embreex")
     part = scene()[0]
@@ -238,13 +176,6 @@ def test_a_prepared_scene_and_samplers_that_take_views_in_turn():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     found = rts.render_views(rts.prepare(part), CAMERAS, SIZE)
     np.testing.assert_allclose(found, looped(part), rtol=0, atol=1e-5)
-
-
-def test_poses_alone_are_differentiated_without_a_look_at_the_mesh():
-    torch = pytest.importorskip("torch")
-    part = scene()[0].replace(transform=rts.rigid(torch.tensor([0.1, 0.2, 0, 0, 0.1, 0])))
-    found = rts.render_views(part, CAMERAS, SIZE)
-    np.testing.assert_allclose(to_numpy(found), looped(part), atol=2e-5)
 
 
 # ------------------------------------------------------------------------------------------ shaders of several views
@@ -419,18 +350,6 @@ def test_the_surface_is_evaluated_once_for_all_views_and_threads_share_the_sampl
     assert len(calls) == 1 and len(threads) == 2
 
 
-def test_pictures_are_bounded_and_more_views_make_more_of_them(monkeypatch):
-    torch = pytest.importorskip("torch")
-    parts = [part.replace(theta={"vertices": torch.tensor(part.theta["vertices"])}) for part in scene()[:2]]
-    expected = rts.render_views(parts, CAMERAS, SIZE)
-    made = []
-    split = Picture.split
-    monkeypatch.setattr(Picture, "split", lambda self, *given: made.append(self.views) or split(self, *given))
-    monkeypatch.setattr(side_by_side, "SIDE", 60)  # Views of 28 × 35 cells, two above one another.
-    torch.testing.assert_close(rts.render_views(parts, CAMERAS, SIZE), expected, rtol=0, atol=2e-5)
-    assert made == [2, 1]
-
-
 def test_an_error_is_that_of_the_first_view_that_fails():
     part = scene()[0]
     broken = [CAMERAS[0], *(c.replace(view=c.view * np.nan) for c in CAMERAS[1:])]
@@ -450,20 +369,6 @@ def test_vmap_over_cameras_is_what_render_views_gives(target):
     stacked = arrays(target, Camera.stack([camera.for_size(SIZE) for camera in CAMERAS]))
     found = batched(target, lambda camera: rts.render(part, camera, SIZE))(stacked)
     np.testing.assert_allclose(to_numpy(found), to_numpy(rts.render_views(part, stacked, SIZE)), atol=2e-5)
-
-
-def test_vmap_over_vertices_of_views():
-    torch = pytest.importorskip("torch")
-    part = mesh_part(icosphere(1), shader="lambert")
-
-    def images(vertices):
-        return rts.render_views(part.replace(theta={"vertices": vertices}), CAMERAS, SIZE)
-
-    # As many samples in no two items.
-    vertices = torch.tensor(part.theta["vertices"])
-    several = torch.stack([vertices, 0.7 * vertices])
-    together = torch.stack([images(v) for v in several])
-    torch.testing.assert_close(torch.vmap(images)(several), together, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("target", ALL)

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, box, gradient, icosphere, relative_error, rigid, to_numpy
-from mixed_scenes import mixed_of
 
 import rts
 from rts import Camera, InputError
@@ -88,23 +87,6 @@ def test_images_and_gradients_are_those_of_a_loop(drawn, shader, options):
     assert relative_error(gradient(TORCH[0], loss(0), transforms), gradient(TORCH[0], loss(1), transforms)) < 1e-5
 
 
-def test_vertices_of_every_scene_have_their_gradient():
-    given = [icosphere(1, 0.5), box(0.5), icosphere(2, 0.6), box(0.4)]
-    weights = torch.as_tensor(np.random.default_rng(0).normal(size=(4, *SIZE, 4)), dtype=torch.float32)
-    found = []
-    for together in (True, False):
-        vertices = [torch.tensor(np.float32(v), requires_grad=True) for v, _ in given]
-        faces = [f for _, f in given]
-        scenes = [[rts.Part(rts.Mesh(f), {"vertices": v}, "lambert")] for v, f in zip(vertices, faces, strict=True)]
-        if together:
-            images = rts.render_views(scenes, CAMERAS, SIZE)
-        else:
-            images = torch.stack([rts.render(s, c, SIZE) for s, c in zip(scenes, CAMERAS, strict=True)])
-        (images * weights).sum().backward()
-        found.append(torch.cat([v.grad for v in vertices]).numpy())
-    assert relative_error(*found) < 1e-5
-
-
 def test_views_that_cut_their_scene_are_drawn_by_themselves(drawn):
     transforms, scenes = pieces(large=(2,))
     once, loop = pair(arrays(TORCH[0], transforms, np.float64), scenes)
@@ -122,17 +104,6 @@ def test_scenes_of_numpy_and_of_surfaces_that_share_no_pass_are_those_of_a_loop(
     images = rts.render_views(mixed, CAMERAS, SIZE)
     expected = [rts.render(own, camera, SIZE) for own, camera in zip(mixed, CAMERAS, strict=True)]
     np.testing.assert_allclose(images, np.stack(expected), rtol=0, atol=2e-5)
-
-
-def test_scenes_of_the_generator_are_those_of_a_loop(drawn):
-    cameras = [Camera.look_at((16 * np.sin(b), 4, 16 * np.cos(b)), (0, 0, 0), fov_y=60) for b in range(6)]
-    scenes = [[part.replace(cull="none") for part in mixed_of(b).parts] for b in range(6)]
-    options = {"layers": 3, "engine": TORCH[0].split("-")[0]}
-    once = to_numpy(rts.render_views(scenes, cameras, SIZE, **options))
-    loop = [to_numpy(rts.render(own, camera, SIZE, **options)) for own, camera in zip(scenes, cameras, strict=True)]
-    # Opaque scenes have one layer, and share a picture of their own.
-    assert drawn == [5]
-    np.testing.assert_allclose(once, np.stack(loop), rtol=0, atol=1e-9)
 
 
 def test_residuals_of_several_views_take_scenes():
@@ -167,21 +138,6 @@ def test_outputs_of_scenes_are_those_of_a_loop(drawn, engine):
         for name in names:
             np.testing.assert_allclose(to_numpy(once[name]), to_numpy(loop[name]), rtol=0, atol=3e-5, err_msg=name)
     assert drawn == [4]
-
-
-def test_residuals_of_outputs_take_scenes():
-    transforms, scenes = pieces("silhouette")
-    names = ("alpha", "depth")
-    targets = rts.render_views(scenes(transforms), CAMERAS, SIZE, outputs=names)
-
-    def moved(shift):
-        matrices = [torch.as_tensor(m) + shift * torch.eye(4)[:, 2:3] @ torch.eye(4)[3:] for m in transforms]
-        return scenes(matrices)
-
-    residuals = rts.ImageResiduals(moved, CAMERAS, SIZE, targets, weights={"depth": 0.1})
-    assert np.abs(to_numpy(residuals(torch.zeros(())))).max() < 1e-5
-    value, matrix, slope = residuals.normal_equations(torch.tensor(0.05))
-    assert value > 1e-6 and matrix > 0 and slope > 0
 
 
 def test_wrong_scenes_are_refused():
