@@ -128,7 +128,7 @@ def result_of(scene, way, view=0):
         if "enough" in way:
             options["capacity"] = least_capacity(scene, cameras, options)
         if "jit" in way:
-            options["capacity"] = room_for_breaks(scene, cameras, options)
+            options["capacity"] = room_for_crossings(scene, cameras, options)
         weights, still = arrays(engine, (weights, _values(scene)), np.float64)
         prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still)) if "prepared" in way else None
 
@@ -164,7 +164,7 @@ def least_capacity(scene, cameras, options):
     return high
 
 
-def room_for_breaks(scene, cameras, options):
+def room_for_crossings(scene, cameras, options):
     """A capacity with which programs have room for the breaks of all views; None if they have it anyway."""
     parts = _parts(scene, _values(scene))
     found = [sampled_with_outlines(parts, camera, scene.size, **options) for camera in cameras]

@@ -120,7 +120,7 @@ def sampled_cards() -> tuple[Any, Any, np.ndarray]:
     return sampled, *found[0]
 
 
-def chosen_break(found: Any, apron: int, y: int, x: int) -> int:
+def chosen_crossing(found: Any, apron: int, y: int, x: int) -> int:
     """The index of the break in the gap along the row from pixel (y, x)."""
     [(index,)] = np.argwhere((found.gap == (y + apron, x + apron, 1)).all(axis=1))
     return int(index)
@@ -144,9 +144,9 @@ def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
     for y, x in np.ndindex(SIDE, SIDE):
         shown = ORANGE if near.contains_point((x + 0.5, y + 0.5)) else BLUE
         axes.plot(x + 0.5, y + 0.5, "o", ms=4.5, color=shown, zorder=4)
-    for ties, square, turn in zip(found.ties, found.square, found.corner, strict=True):
+    for endpoints, square, turn in zip(found.endpoints, found.square, found.corner, strict=True):
         bend = square[::-1] - apron + 0.5 + turn
-        path = np.stack([place[ties[0]], bend, place[ties[1]]])
+        path = np.stack([place[endpoints[0]], bend, place[endpoints[1]]])
         axes.plot(*path.T, color=INK, lw=1.6, zorder=3)
     axes.plot(*place[inside].T, "D", ms=5, mfc="white", mec=INK, zorder=5)
     axes.set(xlim=(0, SIDE), ylim=(SIDE, 0), aspect="equal")
@@ -199,7 +199,7 @@ def gap() -> Figure:
     parts, camera = cards()
     sampled, found, _ = sampled_cards()
     apron, (y, x) = sampled.apron, (4, 3)
-    index = chosen_break(found, apron, y, x)
+    index = chosen_crossing(found, apron, y, x)
     seen_from_the_eye(eye, found, apron)
     eye.add_patch(Rectangle((x + 0.3, y + 0.3), 1.4, 0.4, fc="none", ec=PINK, lw=1.3))
     place = float(found.place[index])

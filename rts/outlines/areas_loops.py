@@ -1,4 +1,4 @@
-"""Areas of the regions into which outlines cut squares of four centres, and fluxes of outlines that move. Compiled.
+"""Areas of the regions into which outlines cut dual cells, and boundary terms of outlines that move. Compiled.
 
 The rule is in `reference`.
 """
@@ -16,29 +16,29 @@ BORDER = 1e-3
 
 @compiled(inline="always")
 def _point(place, x, y, along):
-    """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
+    """A crossing's position in the dual cell of a segment, given its place in a gap that starts at (x, y) there."""
     x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
     return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
 
 
 @compiled(inline="always")
-def _add_flux(flux, s, k, i, share, rates, p, t, dx, dy):
-    """Add a straight piece (dx, dy), at t on piece p of a ray, to the flux in a segment's cell k, for jump i."""
+def _add_term(terms, s, k, i, share, rates, p, t, dx, dy):
+    """Add a straight piece (dx, dy), at t on piece p of a ray, to the term of a segment's cell k, for jump i."""
     for r in range(4):
         rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
-        flux[s, k, i, r, 0] += rate * dy
-        flux[s, k, i, r, 1] -= rate * dx
+        terms[s, k, i, r, 0] += rate * dy
+        terms[s, k, i, r, 1] -= rate * dx
 
 
 @compiled(inline="always")
-def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
-    """Fill in what a break's outline, from its side of a square to a point where others meet, adds to the cells.
+def _weigh_ray(terms, weight, length, s, i, n, side, border, ray, rates, other):
+    """Fill in what a crossing's outline, from its side of a dual cell to a point where others meet, adds to the cells.
 
-    Returns the place of the break on the sides.
+    Returns the place of the crossing on the sides.
 
     Args:
-        flux: (N, 4, 2, 4, 2), to fill for segment s and jump i: for each cell and jump, weights of the motions, along x
-            and y, of the four breaks that pull.
+        terms: (N, 4, 2, 4, 2), to fill for segment s and jump i: for each cell and jump, weights of the motions, along
+            x and y, of the four crossings that pull.
         weight: (N, 4), to fill row n: the areas of the cells' quarters that lie behind the ray, clockwise, but for a
             constant.
         length: (N, 4), to fill row n: the lengths of the ray in the quarters.
@@ -47,8 +47,8 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
         n: the row of `weight`.
         side: the side.
         border: width, in cells, beside borders of pixels in which both have a share.
-        ray: the break, a point between, and where the outlines meet: x and y of each.
-        rates: (2, 2, 4), weights of the motions, of the four breaks that pull, at both ends of both pieces.
+        ray: the crossing, a point between, and where the outlines meet: x and y of each.
+        rates: (2, 2, 4), weights of the motions, of the four crossings that pull, at both ends of both pieces.
         other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
     """
     sign, start = 1.0 if side < 2 else -1.0, on_sides(ray[0][0], ray[0][1], side)
@@ -78,8 +78,8 @@ def _weigh_ray(flux, weight, length, s, i, n, side, border, ray, rates, other):
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
                     own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
-                    _add_flux(flux, s, k, i, own, rates, p, t, dx, dy)
-                    _add_flux(flux, s, k, 1 - i, of_other, rates, p, t, dx, dy)
+                    _add_term(terms, s, k, i, own, rates, p, t, dx, dy)
+                    _add_term(terms, s, k, 1 - i, of_other, rates, p, t, dx, dy)
     return start
 
 
@@ -95,19 +95,19 @@ def _along(a, b, point):
 
 
 @compiled(inline="always")
-def _path(s, place, gap, square, ties, corner):
-    """The start, corner and end of a segment, from the square's first centre."""
-    a, b = ties[s, 0], ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]
-    start = _point(place[a], gap[a, 1] - square[s, 1], gap[a, 0] - square[s, 0], gap[a, 2])
-    end = _point(place[b], gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0], gap[b, 2])
+def _path(s, place, gap, dual, endpoints, corner):
+    """The start, corner and end of a segment, from the dual cell's first centre."""
+    a, b = endpoints[s, 0], endpoints[s, 1] if endpoints[s, 1] >= 0 else endpoints[s, 0]
+    start = _point(place[a], gap[a, 1] - dual[s, 1], gap[a, 0] - dual[s, 0], gap[a, 2])
+    end = _point(place[b], gap[b, 1] - dual[s, 1], gap[b, 0] - dual[s, 0], gap[b, 2])
     return start, (corner[s, 0], corner[s, 1]), end
 
 
 @compiled(inline="always")
-def _meets(path, of_hub):
-    """Where on a half of its hub's path one ends, the number of the rate of this half's end, and where on its chord."""
-    first, near = _along(of_hub[0], of_hub[1], path[1])
-    second, far = _along(of_hub[2], of_hub[1], path[1])
+def _meets(path, of_junction):
+    """Where a path ends on a half of its junction's, which rate is that of the half's end, and where on the chord."""
+    first, near = _along(of_junction[0], of_junction[1], path[1])
+    second, far = _along(of_junction[2], of_junction[1], path[1])
     share, _ = _along(path[0], path[2], path[1])
     return (first, 0, share) if near <= far else (second, 3, share)
 
@@ -127,8 +127,8 @@ def _fill_rates(rates, s, h, e, t, own, share, pull):
 
 
 @compiled
-def _fill_order(count, sides, at, breaks, order):
-    """Fill `order` with the rays of a square, clockwise from its upper left corner by where they start.
+def _fill_order(count, sides, at, crossings, order):
+    """Fill `order` with the rays of a dual cell, clockwise from its upper left corner by where they start.
 
     The first comes again at the end, so that each has one after it.
     """
@@ -136,7 +136,7 @@ def _fill_order(count, sides, at, breaks, order):
         here = e
         while here > 0:
             other = order[here - 1]
-            after = at[other] > at[e] if at[other] != at[e] else (breaks[other] > breaks[e]) == (sides[e] < 2)
+            after = at[other] > at[e] if at[other] != at[e] else (crossings[other] > crossings[e]) == (sides[e] < 2)
             if not (sides[other] > sides[e] or (sides[other] == sides[e] and after)):
                 break
             order[here] = other
@@ -161,57 +161,57 @@ def _behind(start, end, corner):
 
 
 @compiled
-def _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs):
-    """Make one hub of those whose rays alternate around a square, since lines to them cross.
+def _merge_junctions(first, count, order, junctions, corner, weight, last, open_junctions):
+    """Make one junction of those whose rays alternate around a dual cell, since lines to them cross.
 
     Rays of one go on, straight, to the other.
 
     Args:
-        first: the first segment of the square.
+        first: the first segment of the dual cell.
         count: number of rays.
         order: the rays in order, clockwise.
-        hubs: the hub of each ray, counted in the square; changed.
-        corner: (S, 2), where hubs are.
+        junctions: the junction of each ray, counted in the dual cell; changed.
+        corner: (S, 2), where junctions are.
         weight: (N, 4), see `_add_areas`; changed.
-        last: room for a number a hub.
-        open_hubs: room for a number a hub.
+        last: room for a number a junction.
+        open_junctions: room for a number a junction.
     """
     for p in range(count):
-        last[hubs[order[p]]] = p
+        last[junctions[order[p]]] = p
     depth = 0
     for p in range(count):
-        hub, found = hubs[order[p]], -1
-        while depth > 0 and last[open_hubs[depth - 1]] < p:
+        junction, found = junctions[order[p]], -1
+        while depth > 0 and last[open_junctions[depth - 1]] < p:
             depth -= 1
         for d in range(depth):
-            if open_hubs[d] == hub:
+            if open_junctions[d] == junction:
                 found = d
         if found < 0:
-            open_hubs[depth], depth = hub, depth + 1
+            open_junctions[depth], depth = junction, depth + 1
             continue
         for d in range(found + 1, depth):
-            other = open_hubs[d]
+            other = open_junctions[d]
             start = corner[first + other, 0], corner[first + other, 1]
-            end = corner[first + hub, 0], corner[first + hub, 1]
+            end = corner[first + junction, 0], corner[first + junction, 1]
             for e in range(count):
-                for k in range(4 if hubs[e] == other else 0):
-                    hubs[e] = hub
+                for k in range(4 if junctions[e] == other else 0):
+                    junctions[e] = junction
                     weight[e, k] += _behind(start, end, k)
-            last[hub] = max(last[hub], last[other])
+            last[junction] = max(last[junction], last[other])
         depth = found + 1
 
 
 @compiled
-def _fill_regions(count, order, hubs, region):
-    """Fill `region`: for the piece of a square's sides behind each ray, in order, the number of the region there.
+def _fill_regions(count, order, junctions, region):
+    """Fill `region`: for the piece of a dual cell's sides behind each ray, in order, the number of the region there.
 
-    A region reaches from the piece between two rays to others, if these rays end at one hub and no ray of it lies
+    A region reaches from the piece between two rays to others, if these rays end at one junction and no ray of it lies
     between.
 
     Args:
         count: number of rays.
         order: the rays in order, clockwise.
-        hubs: the hub of each ray.
+        junctions: the junction of each ray.
         region: to fill.
     """
     for p in range(count):
@@ -219,7 +219,7 @@ def _fill_regions(count, order, hubs, region):
     for p in range(count):
         last = p - 1 if p > 0 else count - 1
         before = last
-        while hubs[order[before]] != hubs[order[p]]:
+        while junctions[order[before]] != junctions[order[p]]:
             before = before - 1 if before > 0 else count - 1
         own, other = region[before], region[last]
         for q in range(count):
@@ -228,30 +228,30 @@ def _fill_regions(count, order, hubs, region):
 
 @compiled(inline="always")
 def _add_areas(
-    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, corner, cell, centre, shown, colors,
-    parts, n,
+    count, order, sides, crossings, junctions, region, weight, length, area, of_junction, corner, cell, centre, shown,
+    colors, parts, n,
 ):  # fmt: skip
-    """Add entries of colours for the regions of a square in one of its cells. Returns the new number of entries.
+    """Add entries of colours for the regions of a dual cell in one of its cells. Returns the new number of entries.
 
     The cell's own region is the one around its centre, and has the centre's colour, which counts by the whole cell
-    already. The others have a mean of the colours beside them, at the breaks where they begin and end; of several
+    already. The others have a mean of the colours beside them, at the crossings where they begin and end; of several
     outlines around a region each counts by its length in the quarter.
 
     Args:
         count: number of rays.
         order: the rays in order, clockwise.
-        sides: the side of the square that each ray starts from.
-        breaks: the break that it starts from.
-        hubs: the hub of each ray.
+        sides: the side of the dual cell that each ray starts from.
+        crossings: the crossing that it starts from.
+        junctions: the junction of each ray.
         region: see `_fill_regions`.
         weight: (N, 4), the area of the cell's quarter behind each ray, clockwise, up to a constant.
         length: (N, 4), the lengths of rays in the cells' quarters.
         area: room for a number a region.
-        of_hub: room for two numbers a hub.
-        corner: the corner of the square, clockwise from the upper left: 0 to 3.
+        of_junction: room for two numbers a junction.
+        corner: the corner of the dual cell, clockwise from the upper left: 0 to 3.
         cell: the cell's (flat) number.
         centre: the colour of its centre, or −1.
-        shown: (B, 2), see `stencil_loops._of_breaks`.
+        shown: (B, 2), see `stencil_loops._of_crossings`.
         colors: (E, 3) int32, cells, colours, and the colours that these are taken of, or −1: to fill from `n` on.
         parts: (E,) their weights.
         n: number of entries so far.
@@ -277,20 +277,20 @@ def _add_areas(
         if r == own or area[r] == 0:
             continue
         for p in range(count):
-            of_hub[hubs[p], 0], of_hub[hubs[p], 1] = 0.0, 0.0
+            of_junction[junctions[p], 0], of_junction[junctions[p], 1] = 0.0, 0.0
         total = 0.0
         for p in range(2 * count):
             ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
             if region[p // 2] == r:
-                of_hub[hubs[ray], 0] += length[ray, corner] + 1e-9
-                of_hub[hubs[ray], 1] += 1
+                of_junction[junctions[ray], 0] += length[ray, corner] + 1e-9
+                of_junction[junctions[ray], 1] += 1
                 total += length[ray, corner] + 1e-9
         for p in range(2 * count):
             ray = order[(p + 1) // 2]
             if region[p // 2] != r:
                 continue
-            share = area[r] * scale * of_hub[hubs[ray], 0] / (total * of_hub[hubs[ray], 1])
-            color = shown[breaks[ray], int((sides[ray] < 2) == (p % 2 == 0))]
+            share = area[r] * scale * of_junction[junctions[ray], 0] / (total * of_junction[junctions[ray], 1])
+            color = shown[crossings[ray], int((sides[ray] < 2) == (p % 2 == 0))]
             if color >= 0:
                 colors[n, 0], colors[n, 1], colors[n, 2], parts[n] = cell, color, -1, share
                 n += 1
@@ -298,16 +298,16 @@ def _add_areas(
 
 
 @compiled(inline="always")
-def _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, rates, m):
-    """Add entries of motions for a segment, with `flux` of those from `first` on. Returns their new number."""
+def _add_boundary_terms(s, first, terms, dual, width, endpoints, adjacent, shown, movers, moves, motions, rates, m):
+    """Add entries of motions for a segment, with `terms` of those from `first` on. Returns their new number."""
     for j in range(8):
         k, e = j // 2, j % 2
-        cell = (square[s, 0] + (k >= 2)) * width + square[s, 1] + (k == 1 or k == 2)
-        tie = ties[s, e] if ties[s, e] >= 0 else ties[s, 0]
-        before, behind = shown[tie, 0], shown[tie, 1]
+        cell = (dual[s, 0] + (k >= 2)) * width + dual[s, 1] + (k == 1 or k == 2)
+        endpoint = endpoints[s, e] if endpoints[s, e] >= 0 else endpoints[s, 0]
+        before, behind = shown[endpoint, 0], shown[endpoint, 1]
         for r in range(4 if before != behind else 0):
-            x, y = flux[s - first, k, e, r, 0], flux[s - first, k, e, r, 1]
-            b = ties[s, r - 1] if r == 1 or r == 2 else beyond[s, r // 3]
+            x, y = terms[s - first, k, e, r, 0], terms[s - first, k, e, r, 1]
+            b = endpoints[s, r - 1] if r == 1 or r == 2 else adjacent[s, r // 3]
             for i in range(2 if b >= 0 and (x != 0 or y != 0) else 0):
                 of_x = moves[b, i, 0, 0] * x + moves[b, i, 0, 1] * y
                 of_y = moves[b, i, 1, 0] * x + moves[b, i, 1, 1] * y
@@ -320,72 +320,74 @@ def _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, move
 
 
 @compiled
-def add_squares(
-    begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
-    colors, parts, motions, speeds,
+def add_dual_cells(
+    begin, end, place, gap, dual, endpoints, dual_sides, junction, adjacent, corner, pull, at_centres, shown,
+    movers, moves, colors, parts, motions, speeds,
 ):  # fmt: skip
-    """Add the entries of segments, square after square, of the squares that have cells in lines `begin` to `end`.
+    """Add the entries of segments, dual cell after dual cell, of those that have cells in lines `begin` to `end`.
 
-    From each break on a square's sides a ray goes to a hub inside: the corner of its segment, or of the one that this
-    ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops`.
+    From each crossing on a dual cell's sides a ray goes to a junction inside: the corner of its segment, or of the one
+    that this ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops`.
 
     Returns:
         The numbers of entries of colours, and of motions.
     """
-    width, most, stop, first, n, m = fronts.shape[1], 1, 0, 0, 0, 0
-    for s in range(1, len(square)):  # The most segments of one square.
-        stop = stop if square[s, 0] == square[stop, 0] and square[s, 1] == square[stop, 1] else s
+    width, most, stop, first, n, m = at_centres.shape[1], 1, 0, 0, 0, 0
+    for s in range(1, len(dual)):  # The most segments of one dual cell.
+        stop = stop if dual[s, 0] == dual[stop, 0] and dual[s, 1] == dual[stop, 1] else s
         most = max(most, s + 1 - stop)
-    sides, breaks = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
-    order, hubs = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
+    sides, crossings = np.empty(2 * most, np.int64), np.empty(2 * most, np.int64)
+    order, junctions = np.empty(2 * most + 1, np.int64), np.empty(2 * most, np.int64)
     region = np.empty(2 * most, np.int64)
-    last, open_hubs = np.empty(most, np.int64), np.empty(most, np.int64)
-    weight, length, of_hub = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
+    last, open_junctions = np.empty(most, np.int64), np.empty(most, np.int64)
+    weight, length, of_junction = np.empty((2 * most, 4)), np.empty((2 * most, 4)), np.empty((most, 2))
     at, area = np.empty(2 * most), np.empty(2 * most)
-    flux, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
+    terms, members = np.empty((most, 4, 2, 4, 2)), np.empty(most, np.int64)
     rates = np.empty((2, 2, 4))
-    while first < len(square):
+    while first < len(dual):
         stop, count = first + 1, 0
-        while stop < len(square) and square[stop, 0] == square[first, 0] and square[stop, 1] == square[first, 1]:
+        while stop < len(dual) and dual[stop, 0] == dual[first, 0] and dual[stop, 1] == dual[first, 1]:
             stop += 1
-        if not begin - 1 <= square[first, 0] < end:
+        if not begin - 1 <= dual[first, 0] < end:
             first = stop
             continue
-        flux[: stop - first] = 0.0
+        terms[: stop - first] = 0.0
         for s in range(first, stop):
             members[s - first] = 0
         for s in range(first, stop):
-            members[s + hub[s] - first] += ties[s, 0] != ties[s, 1]
+            members[s + junction[s] - first] += endpoints[s, 0] != endpoints[s, 1]
         for s in range(first, stop):
-            if ties[s, 0] == ties[s, 1]:
+            if endpoints[s, 0] == endpoints[s, 1]:
                 continue
-            leader = s + hub[s]
-            both = members[leader - first] == 1 and ties[s, 1] >= 0
-            path, t, own, share = _path(s, place, gap, square, ties, corner), 0.0, 0, 0.0
+            leader = s + junction[s]
+            both = members[leader - first] == 1 and endpoints[s, 1] >= 0
+            path, t, own, share = _path(s, place, gap, dual, endpoints, corner), 0.0, 0, 0.0
             if leader != s:
-                t, own, share = _meets(path, _path(leader, place, gap, square, ties, corner))
-            for e in range(2 if ties[s, 1] >= 0 else 1):
-                side, other = square_sides[s, e], 0.0
+                t, own, share = _meets(path, _path(leader, place, gap, dual, endpoints, corner))
+            for e in range(2 if endpoints[s, 1] >= 0 else 1):
+                side, other = dual_sides[s, e], 0.0
                 if both:
-                    other = 1.0 if square_sides[s, 1 - e] < 2 else -1.0
+                    other = 1.0 if dual_sides[s, 1 - e] < 2 else -1.0
                 _fill_rates(rates, leader, s, e, t, own, share, pull)
                 ray = path[2 * e], path[1], (corner[leader, 0], corner[leader, 1])
-                at[count] = _weigh_ray(flux, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
-                sides[count], breaks[count], hubs[count] = side, ties[s, e], leader - first
+                at[count] = _weigh_ray(terms, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
+                sides[count], crossings[count], junctions[count] = side, endpoints[s, e], leader - first
                 count += 1
         if count > 0:
-            _fill_order(count, sides, at, breaks, order)
+            _fill_order(count, sides, at, crossings, order)
             if count > 3:  # Fewer rays do not alternate.
-                _merge_hubs(first, count, order, hubs, corner, weight, last, open_hubs)
-            _fill_regions(count, order, hubs, region)
+                _merge_junctions(first, count, order, junctions, corner, weight, last, open_junctions)
+            _fill_regions(count, order, junctions, region)
             for k in range(4):
-                y, x = square[first, 0] + (k >= 2), square[first, 1] + (k == 1 or k == 2)
+                y, x = dual[first, 0] + (k >= 2), dual[first, 1] + (k == 1 or k == 2)
                 n = _add_areas(
-                    count, order, sides, breaks, hubs, region, weight, length, area, of_hub, k, y * width + x,
-                    fronts[y, x], shown, colors, parts, n,
+                    count, order, sides, crossings, junctions, region, weight, length, area, of_junction, k,
+                    y * width + x, at_centres[y, x], shown, colors, parts, n,
                 )  # fmt: skip
         for s in range(first, stop):
-            if ties[s, 0] != ties[s, 1]:
-                m = _add_fluxes(s, first, flux, square, width, ties, beyond, shown, movers, moves, motions, speeds, m)
+            if endpoints[s, 0] != endpoints[s, 1]:
+                m = _add_boundary_terms(
+                    s, first, terms, dual, width, endpoints, adjacent, shown, movers, moves, motions, speeds, m
+                )
         first = stop
     return n, m

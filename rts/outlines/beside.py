@@ -1,4 +1,4 @@
-"""Breaks of a scene, as many as there is room for, and the samples beside them that tell colours and motions."""
+"""Crossings of a scene, as many as there is room for, and the samples beside them that tell colours and motions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Told
-from rts.outlines.gaps import Breaks, Fronts, Stacks
-from rts.outlines.sheets import Sheets
-from rts.outlines.spans import breaks_of_triangles
+from rts.outlines.found import Required
+from rts.outlines.gaps import Crossings, Hits, Stacks
+from rts.outlines.seen_mesh import SeenMesh
+from rts.outlines.spans import crossings_of_triangles
 
 
 class Beside(NamedTuple):
-    """The M samples that outlines need beside breaks. Host arrays.
+    """The M samples that outlines need beside crossings. Host arrays.
 
     Attributes:
         place: (M,) int, places in `Outlines.rows`, (B, columns).
@@ -34,63 +34,64 @@ class Beside(NamedTuple):
     columns: int
 
     @classmethod
-    def of(cls, breaks: Breaks, stacks: Stacks | None, told: Told) -> Beside:
-        """The samples that stand for `told` beside breaks of one layer, or that stacks have there."""
+    def of(cls, crossings: Crossings, stacks: Stacks | None, required: Required) -> Beside:
+        """The samples that stand for `required` beside crossings of one layer, or that stacks have there."""
         from rts.outlines import samples_loops
 
         if stacks is not None:
             parts = np.concatenate([stacks.last, stacks.parts], 1)
             (place,) = (parts.reshape(-1) >= 0).nonzero()
-            triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
-            points = np.concatenate([breaks.points, stacks.points], 1)
+            triangles = np.concatenate([crossings.triangles[:, :2], stacks.triangles], 1)
+            points = np.concatenate([crossings.points, stacks.points], 1)
             part, triangle, number = (x.reshape(-1).take(place) for x in (parts, triangles, stacks.numbers))
             return cls(place, part, triangle, points.reshape(-1, 2)[place], number, parts.shape[1])
-        most = 4 * len(breaks.gap)
+        most = 4 * len(crossings.gap)
         place, part, triangle = np.empty((3, most), np.int32)
         points = np.empty((most, 2))
-        of_breaks = breaks.parts, breaks.ends, breaks.points, breaks.inner, breaks.triangles
-        count = samples_loops.needed(*of_breaks, *told, place, part, triangle, points)
+        of_crossings = crossings.parts, crossings.ends, crossings.points, crossings.inner, crossings.triangles
+        count = samples_loops.needed(*of_crossings, *required, place, part, triangle, points)
         return cls(place[:count], part[:count], triangle[:count], points[:count], np.zeros(count, np.int32), 6)
 
-    def table(self, breaks: int, values: np.ndarray) -> np.ndarray:
+    def table(self, crossings: int, values: np.ndarray) -> np.ndarray:
         """A table (B, columns) int32 with a value (M,) for each sample; else −1."""
-        table = np.full((breaks, self.columns), -1, np.int32)
+        table = np.full((crossings, self.columns), -1, np.int32)
         table.reshape(-1)[self.place] = values
         return table
 
 
-def breaks_of_sheets(
-    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray, seams: bool
-) -> tuple[Breaks, Stacks | None]:
-    """The breaks between what is seen at centres (K, H, W); of several layers, nothing behind an opaque one."""
+def crossings_of_meshes(
+    layers: Hits, opaque: np.ndarray, meshes: Sequence[SeenMesh], width: np.ndarray, seams: bool
+) -> tuple[Crossings, Stacks | None]:
+    """The crossings between what is seen at centres (K, H, W); of several layers, nothing behind an opaque one."""
     if len(layers.part) == 1:
-        return breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, width, seams), None
-    from rts.outlines.stacks import breaks_of_stacks
+        return crossings_of_triangles(Hits(*(x[0] for x in layers)), meshes, width, seams), None
+    from rts.outlines.stacks import crossings_of_stacks
 
-    return breaks_of_stacks(layers, opaque, sheets, width, seams)
+    return crossings_of_stacks(layers, opaque, meshes, width, seams)
 
 
 def limited(
-    find: Callable[[bool], tuple[Breaks, Stacks | None]], most: int | None, seams: bool
-) -> tuple[Breaks, Stacks | None, int]:
-    """The breaks that `find` gives, and their stacks, at most so many; and the number of those left out.
+    find: Callable[[bool], tuple[Crossings, Stacks | None]], most: int | None, seams: bool
+) -> tuple[Crossings, Stacks | None, int]:
+    """The crossings that `find` gives, and their stacks, at most so many; and the number of those left out.
 
-    `find` takes whether there are breaks at seams, which are left out before outlines are; `seams` is what is wanted.
+    `find` takes whether there are crossings at seams, which are left out before outlines are; `seams` is what is
+    wanted.
 
     Warns:
         InputWarning: some are left out.
     """
-    breaks, stacks = find(seams)
-    count = len(breaks.gap)
+    crossings, stacks = find(seams)
+    count = len(crossings.gap)
     if most is None or count <= most:
-        return breaks, stacks, 0
+        return crossings, stacks, 0
     if seams:
-        breaks, stacks = find(False)
-    left = count - min(most, len(breaks.gap))
+        crossings, stacks = find(False)
+    left_out = count - min(most, len(crossings.gap))
     warn(
-        f"{left} breaks of outlines find no room beside {most}, and edges there neither move nor are smooth; "
+        f"{left_out} crossings of outlines find no room beside {most}, and edges there neither move nor are smooth; "
         f"give the compiled program capacity={4 * count} or more",
         InputWarning,
     )
-    breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-    return breaks, stacks if stacks is None else Stacks(*(x[:most] for x in stacks)), left
+    crossings = Crossings(*(x if name == "joined" else x[:most] for name, x in crossings._asdict().items()))
+    return crossings, stacks if stacks is None else Stacks(*(x[:most] for x in stacks)), left_out

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
-from rts.outlines.gaps import Breaks
+from rts.outlines.gaps import Crossings
 from rts.outlines.segments import joined
 from rts.sampling.entries import is_still
 from rts.sampling.scene import Scene
@@ -20,75 +20,77 @@ class Outlines(NamedTuple):
     """Outlines between the centres of cells: places where a front ends, joined into segments. Host arrays.
 
     A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
-    another surface, or across a seam, is a break. Four neighbouring centres are the corners of a square; breaks on its
-    sides are joined into segments.
+    another surface, or across a seam, is a crossing. Four neighbouring centres are the corners of a dual cell;
+    crossings on its sides are joined into segments.
 
     Attributes:
-        rows: (B, 6) int32, for each break two samples that tell motions, before and behind it along its gap; two that
-            tell colours (−1 if only one of both is told, see `Told`), since in the last hair before an outline normals
-            may turn away, and colours with them; and a pair on the ray of the last sample of the surface that ends,
-            beside its deepest point, whose mean moves as the outline (`RaySurface.deepest`): a single sample does not
-            tell how a kink of a field moves. −1 stands for none. Of K layers (B, 2 + K + 1): the two last samples,
-            only where the layer that ends is, or two where layers cross; and those of the stack there.
+        rows: (B, 6) int32, for each crossing two samples that tell motions, before and behind it along its gap; two
+            that tell colours (−1 if only one of both is told, see `Required`), since in the last hair before an outline
+            normals may turn away, and colours with them; and a pair on the ray of the last sample of the surface that
+            ends, beside its deepest point, whose mean moves as the outline (`RaySurface.deepest`): a single sample does
+            not tell how a kink of a field moves. −1 stands for none. Of K layers (B, 2 + K + 1): the two last samples,
+            only where the layer that ends is, or two where layers intersect; and those of the stack there.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
-        place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
+        place: (B,) float64, the place of each crossing along its gap: 0 at the first centre, 1 at the second.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
-        near: (B,) int32, `edge_kinds.BEFORE_ENDS`, BEHIND_ENDS or CROSS; BEFORE_ENDS at seams, where a surface goes on
-            and its colours may change. Of several layers it is about the one that ends there.
-        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is CROSS; else 0.
-        ends: (B, 2) bool: is this the gap's first break, and its last?
-        square: (S, 2) int32, the first corner (y, x) of each segment's square.
-        ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
-            the other. −1 in second place if a break is alone. Segments of one square follow one another.
-        square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
-        hub: (S,) int32, how many rows farther on there is the segment, of the same square, that the outline of a lone
-            break ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `beyond` has the
-            breaks of that segment, and `pull` weights of their motions, first and last, whose sum is about the motion
-            of that segment's corner. Lone breaks with no segment beside them have the first of them as their hub.
-        beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
-        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
-        pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
-            is the motion of the corner.
+        kind: (B,) int32, `edge_kinds.BEFORE_ENDS`, BEHIND_ENDS or INTERSECT; BEFORE_ENDS at seams, where a surface goes
+            on and its colours may change. Of several layers it is about the one that ends there.
+        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `kind` is INTERSECT; else 0.
+        ends: (B, 2) bool: is this the gap's first crossing, and its last?
+        dual: (S, 2) int32, the first corner (y, x) of each segment's dual cell.
+        endpoints: (S, 2) int32, the two crossings of each segment; the near surface lies to the right of the way from
+            one to the other. −1 in second place if a crossing is alone. Segments of one dual cell follow one another.
+        dual_sides: (S, 2) int32, the sides of the dual cell that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        junction: (S,) int32, how many rows farther on there is the segment, of the same dual cell, that the outline of
+            a lone crossing ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `adjacent`
+            has the crossings of that segment, and `pull` weights of their motions, first and last, whose sum is about
+            the motion of that segment's corner. Lone crossings with no segment beside them have the first of them as
+            their junction.
+        adjacent: (S, 2) int32, the crossings along the same outline before and after these two; −1 for none.
+        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the dual cell's first
+            centre.
+        pull: (S, 4) float64, weights of the motions of the crossing before, of these two, and of the one after, whose
+            sum is the motion of the corner.
         joined: (2, H, W) bool, see `Stencil`.
-        left: number of breaks left out for want of room.
+        left_out: number of crossings left out for want of room.
     """
 
     rows: np.ndarray
     sides: np.ndarray
     place: np.ndarray
     gap: np.ndarray
-    near: np.ndarray
+    kind: np.ndarray
     slope: np.ndarray
     ends: np.ndarray
-    square: np.ndarray
-    ties: np.ndarray
-    square_sides: np.ndarray
-    hub: np.ndarray
-    beyond: np.ndarray
+    dual: np.ndarray
+    endpoints: np.ndarray
+    dual_sides: np.ndarray
+    junction: np.ndarray
+    adjacent: np.ndarray
     corner: np.ndarray
     pull: np.ndarray
     joined: np.ndarray
-    left: int
+    left_out: int
 
     @classmethod
-    def of(cls, breaks: Breaks, rows: np.ndarray, sides: np.ndarray | None = None, left: int = 0) -> Outlines:
-        """Outlines of breaks whose samples are `rows`; `sides` are there if light passes through, see `joined`."""
+    def of(cls, crossings: Crossings, rows: np.ndarray, sides: np.ndarray | None = None, left_out: int = 0) -> Outlines:
+        """Outlines of crossings whose samples are `rows`; `sides` are there if light passes through, see `joined`."""
         from rts.outlines import segments_loops
 
         count = len(rows)
-        place, near = np.empty(count), np.empty(count, np.int32)
-        segments_loops.places(breaks.gap, breaks.place, breaks.near, place, near)
+        place, kind = np.empty(count), np.empty(count, np.int32)
+        segments_loops.places(crossings.gap, crossings.place, crossings.kind, place, kind)
         layered = sides is not None
         sides = np.empty((count, 2, 0), np.int32) if sides is None else sides
-        of_breaks = place, breaks.gap, near, breaks.slope, breaks.ends
-        return cls(rows, sides, *of_breaks, *joined(breaks, layered), breaks.joined, left)
+        of_crossings = place, crossings.gap, kind, crossings.slope, crossings.ends
+        return cls(rows, sides, *of_crossings, *joined(crossings, layered), crossings.joined, left_out)
 
-    def stencil(self, row: np.ndarray, told: Told, real: Any) -> Stencil:
-        """The areas and fluxes beside outlines, whose `rows` are counted over all parts.
+    def stencil(self, row: np.ndarray, required: Required, real: Any) -> Stencil:
+        """The areas and boundary terms beside outlines, whose `rows` are counted over all parts.
 
         Args:
             row: (K, H, W) int32, the samples in cells, counted likewise.
-            told: what samples tell.
+            required: what samples tell.
             real: the dtype of weights.
         """
         from rts.outlines import stencil_loops as loops
@@ -100,38 +102,38 @@ class Outlines(NamedTuple):
             stack = np.where(self.sides >= 0, stack, np.int32(-1))
             samples = last, last, none, stack
         else:
-            samples = *self._colored(rows, row[0], told), rows[:, 4:], self.sides
-        of_breaks = self.place, self.gap, self.near, self.slope, self.ends, *map(np.ascontiguousarray, samples)
-        of_segments = self.square, self.ties, self.square_sides, self.hub, self.beyond, self.corner, self.pull
-        arrays: Any = *of_breaks, *of_segments, self.joined, read_only(row, np.int32), real
+            samples = *self._colored(rows, row[0], required), rows[:, 4:], self.sides
+        of_crossings = self.place, self.gap, self.kind, self.slope, self.ends, *map(np.ascontiguousarray, samples)
+        of_segments = self.dual, self.endpoints, self.dual_sides, self.junction, self.adjacent, self.corner, self.pull
+        arrays: Any = *of_crossings, *of_segments, self.joined, read_only(row, np.int32), real
         found: Any = loops.entries(*arrays)
         (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
         stacks = stacks if self.sides.shape[2] else None
         return Stencil(self.joined, cell, sample, weight, moved_cell, mover, rates, jumps, stacks)
 
-    def _colored(self, rows: np.ndarray, front: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
+    def _colored(self, rows: np.ndarray, at_centres: np.ndarray, required: Required) -> tuple[np.ndarray, np.ndarray]:
         """The samples (B, 2) that tell motions, and those that tell colours, or −1 for the former.
 
         Colours may be those of centres (H, W), on surfaces that reach these; of other pieces, one sample's.
         """
         last, inner = rows[:, :2], rows[:, 2:4]
-        if not told.centers:
+        if not required.centers:
             return last, inner
         y, x, along = self.gap.T
-        first, second = front[y, x], front[y + 1 - along, x + along]
-        # Behind the last break, or before this one.
+        first, second = at_centres[y, x], at_centres[y + 1 - along, x + along]
+        # Behind the last crossing, or before this one.
         before = np.where(self.ends[:, 0], first, np.roll(last[:, 1], 1))
         colors = np.stack([before, np.where(self.ends[:, 1], second, last[:, 1])], axis=1)
-        return (last, colors) if told.motions else (colors, inner)
+        return (last, colors) if required.motions else (colors, inner)
 
 
 COLORS, MOTIONS = 16, 32
-"""Entries of colours and of motions, for each break, for which programs of fixed shapes have room. Of a ball, a teapot
-and a bunny 3 and 13 are in use; of three balls of glass 5 and 28, for which there is twice the room."""
+"""Entries of colours and of motions, for each crossing, for which programs of fixed shapes have room. Of a ball, a
+teapot and a bunny 3 and 13 are in use; of three balls of glass 5 and 28, for which there is twice the room."""
 
 
 def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
-    """Specs of the fields of a stencil with room for at most so many breaks."""
+    """Specs of the fields of a stencil with room for at most so many crossings."""
     colors, motions = COLORS * most, MOTIONS * most * (1 if layers == 1 else 2)
     shapes = [((2, *size), np.bool_, False), ((colors,), np.int32, True), ((colors,), np.int32, True)]
     shapes += [((colors,), real, True), ((motions,), np.int32, True), ((motions,), np.int32, True)]
@@ -142,7 +144,7 @@ def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[Arra
 
 
 def fits(stencil: Stencil, most: int | None) -> bool:
-    """True if a stencil has room in `specs` of so many breaks; None for any."""
+    """True if a stencil has room in `specs` of so many crossings; None for any."""
     if most is None:
         return True
     layers = 1 if stencil.stacks is None else stencil.stacks.shape[1]
@@ -158,8 +160,8 @@ def arrays_of(stencil: Stencil) -> list[Any]:
 FIELDS = tuple(field.name for field in fields(Stencil))
 
 
-class Told(NamedTuple):
-    """The tasks of samples beside a break. Of one layer two samples tell colours or motions, and four tell both.
+class Required(NamedTuple):
+    """The tasks of samples beside a crossing. Of one layer two samples tell colours or motions, and four tell both.
 
     Attributes:
         colors: False if each part has one colour, which any of its samples tells.
@@ -172,14 +174,14 @@ class Told(NamedTuple):
     centers: bool = False
 
     @classmethod
-    def of(cls, scenes: Sequence[Scene], centers: bool) -> Told:
+    def of(cls, scenes: Sequence[Scene], centers: bool) -> Required:
         """The tasks that the shaders of scenes, and derivatives in their values, set."""
         # Of one colour any two samples tell all, those of motions too.
         uniform = all(part.uniform for scene in scenes for part in scene.parts)
         return cls(not uniform, uniform or not all(map(is_still, scenes)), centers and not uniform)
 
     def samples(self, layers: int) -> int:
-        """The largest number of samples of a break, but for a pair."""
+        """The largest number of samples of a crossing, but for a pair."""
         if layers > 1:
             return layers + 3
         return 4 if self.colors and self.motions and not self.centers else 2

@@ -1,7 +1,7 @@
-"""Records of what is seen at centres, of the gaps between these, and of the breaks in gaps.
+"""Records of what is seen at centres, of the gaps between these, and of the crossings in gaps.
 
-A break is a place between neighbouring centres where a layer that is seen ends, or two cross. Of opaque surfaces there
-is one layer, the front.
+A crossing is a place between neighbouring centres where a layer that is seen ends, or two intersect. Of opaque surfaces
+there is one layer, the front.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 INNER = 0.1
-"""Distance from a break, in cells, of the samples that tell colours; half the way to the next break if that is less."""
+"""Distance from a crossing, in cells, of the samples that tell colours; half the way to the next if that is less."""
 
 
-class Fronts(NamedTuple):
-    """The surfaces seen at M points of the image. Host arrays, (M,) for fronts, (K, M) for K layers, front to back.
+class Hits(NamedTuple):
+    """The surfaces seen at M points of the image. Host arrays, (M,) for first hits, (K, M) for K layers, front to back.
 
     Attributes:
         part: int32, −1 where nothing is seen.
@@ -28,16 +28,16 @@ class Fronts(NamedTuple):
     triangle: np.ndarray
     depth: np.ndarray
 
-    def at(self, index: np.ndarray) -> Fronts:
+    def at(self, index: np.ndarray) -> Hits:
         """What is seen at the points with some indices."""
-        return Fronts(*(x[..., index] for x in self))
+        return Hits(*(x[..., index] for x in self))
 
-    def of_layer(self, layer: np.ndarray) -> Fronts:
+    def of_layer(self, layer: np.ndarray) -> Hits:
         """The layers (M,) with a number of its own at each point."""
-        return Fronts(*(x[layer, np.arange(len(layer))] for x in self))
+        return Hits(*(x[layer, np.arange(len(layer))] for x in self))
 
     @classmethod
-    def of(cls, several: Sequence[Fronts]) -> Fronts:
+    def of(cls, several: Sequence[Hits]) -> Hits:
         """What is seen at several sets of points, one after the other."""
         return cls(*(np.concatenate(x, axis=-1) for x in zip(*several, strict=True)))
 
@@ -70,16 +70,16 @@ class Gaps(NamedTuple):
         return cls(gap, rows, columns, cells)
 
 
-class Breaks(NamedTuple):
-    """Breaks, those of a gap in order along it. Host arrays; see `rts.outlines.found.Outlines`.
+class Crossings(NamedTuple):
+    """Crossings, those of a gap in order along it. Host arrays; see `rts.outlines.found.Outlines`.
 
     Attributes:
         gap: (B, 3) int32.
         place: (B, 2) float64.
-        near: (B,) int32; see `edge_kinds`.
+        kind: (B,) int32; see `edge_kinds`.
         slope: (B, 2, 2) float64.
         ends: (B, 2) bool.
-        points: (B, 2, 2) float64, x and y of the last samples before and behind each break.
+        points: (B, 2, 2) float64, x and y of the last samples before and behind each crossing.
         inner: (B, 2, 2) float64, x and y of the samples that tell colours.
         parts: (B, 2) int32, their parts, or −1.
         joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
@@ -91,7 +91,7 @@ class Breaks(NamedTuple):
 
     gap: np.ndarray
     place: np.ndarray
-    near: np.ndarray
+    kind: np.ndarray
     slope: np.ndarray
     ends: np.ndarray
     points: np.ndarray
@@ -104,14 +104,15 @@ class Breaks(NamedTuple):
 
 
 class Stacks(NamedTuple):
-    """The stacks beside breaks. Host arrays.
+    """The stacks beside crossings. Host arrays.
 
     Attributes:
-        last: (B, 2) int32, the parts of the last samples before and behind each break; −1 on sides that do not move it.
-        parts: (B, K + 1) int32, the parts of the layers at each break, front to back, or −1.
+        last: (B, 2) int32, the parts of the last samples before and behind each crossing; −1 on sides that do not move
+            it.
+        parts: (B, K + 1) int32, the parts of the layers at each crossing, front to back, or −1.
         triangles: (B, K + 1) int32, their triangles; −1 where none is known.
         points: (B, K + 1, 2) float64, x and y of their samples.
-        sides: (B, 2, K) int32, the stacks before and behind each break, as indices of these samples, or −1.
+        sides: (B, 2, K) int32, the stacks before and behind each crossing, as indices of these samples, or −1.
         numbers: (B, 2 + K + 1) int32, of the last samples and of these: how many layers of the same part are in front.
     """
 

@@ -1,7 +1,7 @@
-"""Breaks where triangles do not tell them: lines between neighbouring centres are halved.
+"""Crossings where triangles do not tell them: lines between neighbouring centres are halved.
 
 There the layers at two neighbouring centres are the same surfaces if their depths differ about as much as beside. Else
-the line between the centres is halved until each break is known.
+the line between the centres is halved until each crossing is known.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
-from rts.outlines.gaps import INNER, Breaks, Fronts, Stacks
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
+from rts.outlines.gaps import INNER, Crossings, Hits, Stacks
 
 FINE = 1e-4
-"""Length of the interval, in cells, in which a break is known to lie."""
+"""Length of the interval, in cells, in which a crossing is known to lie."""
 
 BESIDE = 0.05
-"""Distance from a crossing, in cells, of the samples that tell how depths change."""
+"""Distance from an intersection, in cells, of the samples that tell how depths change."""
 
 ASIDE, ASIDE_HALVINGS = 0.02, 12
-"""Distance from a break, in cells, at which it is looked for once more, to tell the outline's direction, up to four
+"""Distance from a crossing, in cells, at which it is looked for once more, to tell the outline's direction, up to four
 times as far before or behind; and how often that interval is halved."""
 
 STEEP, RISE = 1.5, 0.1
@@ -37,7 +37,7 @@ class Oracle(NamedTuple):
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
 
-    layers: Callable[[np.ndarray], Fronts]
+    layers: Callable[[np.ndarray], Hits]
     width: np.ndarray
 
     def widths(self, depth: np.ndarray) -> np.ndarray:
@@ -51,8 +51,8 @@ class _Intervals(NamedTuple):
     gap: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    before: Fronts
-    behind: Fronts
+    before: Hits
+    behind: Hits
 
     def at(self, index: np.ndarray) -> _Intervals:
         places = self.gap[index], self.low[index], self.high[index]
@@ -62,9 +62,7 @@ class _Intervals(NamedTuple):
     def of(cls, several: Sequence[_Intervals]) -> _Intervals:
         """Several intervals, one after the other."""
         gap, low, high = (np.concatenate([one[i] for one in several]) for i in range(3))
-        return cls(
-            gap, low, high, Fronts.of([one.before for one in several]), Fronts.of([one.behind for one in several])
-        )
+        return cls(gap, low, high, Hits.of([one.before for one in several]), Hits.of([one.behind for one in several]))
 
 
 class _Lines(NamedTuple):
@@ -90,8 +88,8 @@ class Hints(NamedTuple):
     place: np.ndarray
 
 
-def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> tuple[Breaks, Stacks]:
-    """The breaks between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there.
+def find_crossings(layers: Hits, oracle: Oracle, hints: Hints | None = None) -> tuple[Crossings, Stacks]:
+    """The crossings between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there.
 
     Where these centres see the same, a gap is looked at only if it has hints, and at their places first.
     """
@@ -120,22 +118,24 @@ def find_breaks(layers: Fronts, oracle: Oracle, hints: Hints | None = None) -> t
     ]
     points, beside = (np.stack([gaps.points(number, at) for at in two], 1) for two in ((low, high), inner))
     change = _Change.of(found, oracle)
-    near, slope = change.classified(found, gaps, oracle)
-    breaks = Breaks(
+    kind, slope = change.classified(found, gaps, oracle)
+    crossings = Crossings(
         gap[number],
         gaps.points(number, (low + high) / 2),
-        near,
+        kind,
         slope,
         np.stack([first, last], 1),
         points,
         beside,
-        change.parts(near),
+        change.parts(kind),
         joined,
         np.full((len(number), 4), -1, np.int32),
-        np.where((near == CROSS)[:, None], lines_of_crossing(slope), _directions(found, gap[number], gaps, oracle)),
-        cells_away(change.depth(near), oracle.width),
+        np.where(
+            (kind == INTERSECT)[:, None], lines_of_intersection(slope), _directions(found, gap[number], gaps, oracle)
+        ),
+        cells_away(change.depth(kind), oracle.width),
     )
-    return breaks, change.stacks(near, points, beside)
+    return crossings, change.stacks(kind, points, beside)
 
 
 def _unsearched(
@@ -153,7 +153,7 @@ def _unsearched(
 
 
 def _intervals(
-    count: int, one: Fronts, other: Fronts, hinted: np.ndarray, place: np.ndarray, gaps: _Lines, oracle: Oracle
+    count: int, one: Hits, other: Hits, hinted: np.ndarray, place: np.ndarray, gaps: _Lines, oracle: Oracle
 ) -> _Intervals:
     """The intervals to halve: the first `count` gaps, whose ends see `one` and `other`; others between their hints.
 
@@ -167,7 +167,7 @@ def _intervals(
     first, last = np.diff(hinted, prepend=-1) != 0, np.diff(hinted, append=-1) != 0
     n = np.arange(len(hinted))
     # What is seen at hints, then at first centres, then at second ones.
-    every = Fronts.of([seen, one.at(hinted), other.at(hinted)])
+    every = Hits.of([seen, one.at(hinted), other.at(hinted)])
     before, ends = np.where(first, len(n) + n, n - 1), np.flatnonzero(last)
     low = np.where(first, 0.0, np.roll(place, 1))
     return _Intervals.of(
@@ -180,7 +180,7 @@ def _intervals(
 
 
 def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Unit directions (B, 2) of outlines at breaks, by where these are `ASIDE`; 0 where they are unknown.
+    """Unit directions (B, 2) of outlines at crossings, by where these are `ASIDE`; 0 where they are unknown.
 
     Only where more than two are on the sides of a square of centres, and so it is not plain which belong together.
 
@@ -220,37 +220,37 @@ def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle
     return direction
 
 
-def _unlike(a: Fronts, b: Fronts) -> np.ndarray:
+def _unlike(a: Hits, b: Hits) -> np.ndarray:
     """(M,) how far layers are from others, by depth; far where their parts differ."""
     return np.where(a.part == b.part, np.abs(a.depth - b.depth), 1e30).sum(0)
 
 
 def cells_away(depth: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """`Breaks.cells_away` (B,) at depths (B,); `width` as in `Oracle`."""
+    """`Crossings.cells_away` (B,) at depths (B,); `width` as in `Oracle`."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.log(width[0] + width[1] * depth) / width[1] if width[1] > 0 else depth / width[0]
 
 
-def lines_of_crossing(slope: np.ndarray) -> np.ndarray:
-    """Unit directions (B, 2) in the image of the lines where surfaces cross, from both slopes; 0 where they are equal.
+def lines_of_intersection(slope: np.ndarray) -> np.ndarray:
+    """Unit directions (B, 2) in the image of the lines where surfaces intersect, from both slopes; 0 where these agree.
 
     Args:
-        slope: (B, 2, 2), see `Breaks.slope`.
+        slope: (B, 2, 2), see `Crossings.slope`.
     """
     difference = slope[:, 1] - slope[:, 0]
     length = np.hypot(*difference.T)
     return np.column_stack([difference[:, 1], -difference[:, 0]]) / np.where(length > 0, length, 1.0)[:, None]
 
 
-def _ends(gap: np.ndarray, layers: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
+def _ends(gap: np.ndarray, layers: Hits) -> tuple[Hits, Hits, np.ndarray, np.ndarray]:
     """The layers at both centres of gaps (M, 3), the first centres (M, 2), and steps (M, 2) to the others."""
     y, x, axis = gap.T
     step = np.column_stack([axis == 1, axis == 0])
-    first, second = (Fronts(*(table[:, y + k * step[:, 1], x + k * step[:, 0]] for table in layers)) for k in (0, 1))
+    first, second = (Hits(*(table[:, y + k * step[:, 1], x + k * step[:, 0]] for table in layers)) for k in (0, 1))
     return first, second, np.column_stack([x, y]) + 0.5, step.astype(float)
 
 
-def _smooth(layers: Fronts, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def _smooth(layers: Hits, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Do depths from cells to the next ones along an axis change about as beside? (M,) bool; see `STEEP`."""
     depth = np.where(layers.part >= 0, layers.depth, np.nan)
     steps = [np.abs(np.diff(depth, axis=1, append=np.nan)), np.abs(np.diff(depth, axis=2, append=np.nan))]
@@ -263,7 +263,7 @@ def _smooth(layers: Fronts, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: 
     return np.logical_not(steep.any(0))
 
 
-def _level(a: Fronts, b: Fronts, oracle: Oracle) -> np.ndarray:
+def _level(a: Hits, b: Hits, oracle: Oracle) -> np.ndarray:
     """True for layers of one part, or none, at nearly one depth; see `RISE`."""
     level = np.abs(a.depth - b.depth) <= RISE * oracle.widths(a.depth)
     return (a.part == b.part) & ((a.part < 0) | level)
@@ -295,7 +295,7 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
     return _Intervals.of(finished)
 
 
-def _goes_on(steps: Sequence[Fronts], oracle: Oracle) -> np.ndarray:
+def _goes_on(steps: Sequence[Hits], oracle: Oracle) -> np.ndarray:
     """(M,) True where the layers at places that follow one another change about evenly; see `STEEP`."""
     part, depth = (np.stack([x[i] for x in steps]) for i in (0, 2))
     change = np.abs(np.diff(depth, axis=0))
@@ -305,7 +305,7 @@ def _goes_on(steps: Sequence[Fronts], oracle: Oracle) -> np.ndarray:
     return (part == part[:1]).all((0, 1)) & even.all((0, 1))
 
 
-def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:
+def _halves(found: _Intervals, in_middle: Hits, oracle: Oracle) -> tuple[_Intervals, list[np.ndarray]]:
     """The halves of intervals in which a surface may end, all first ones before all second ones.
 
     `in_middle` is what is seen in the middle of each interval. The second result are the intervals' indices, of both.
@@ -315,7 +315,7 @@ def _halves(found: _Intervals, in_middle: Fronts, oracle: Oracle) -> tuple[_Inte
         _Intervals(found.gap, found.low, middle, found.before, in_middle),
         _Intervals(found.gap, middle, found.high, in_middle, found.behind),
     ]
-    # Within the same parts the half in which a depth changes more has the break.
+    # Within the same parts the half in which a depth changes more has the crossing.
     alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
     changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
     drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
@@ -332,20 +332,20 @@ class _Change(NamedTuple):
         goes_on: for each side (K, B) int, the layer of the other side that is the same surface, or −1.
         first: (B,) the first layer in which the sides differ.
         ends: for each side (B,) its first layer that does not go on; `first` where all do, in another order.
-        near: (B,) int32, the side whose such layer is nearer.
+        kind: (B,) int32, the side whose such layer is nearer.
     """
 
-    sides: tuple[Fronts, Fronts]
+    sides: tuple[Hits, Hits]
     goes_on: tuple[np.ndarray, np.ndarray]
     first: np.ndarray
     ends: tuple[np.ndarray, np.ndarray]
-    near: np.ndarray
+    kind: np.ndarray
 
     @classmethod
     def of(cls, found: _Intervals, oracle: Oracle) -> _Change:
         """The changes in intervals."""
         sides, index = (found.before, found.behind), np.arange(len(found.before.part))
-        a, b = (Fronts(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
+        a, b = (Hits(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
         distance = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
         one = (distance == distance.min(0)) & (distance == distance.min(1)[:, None]) & np.isfinite(distance)
         # Within the same parts the layer whose depth changes most ends, as others may be steep.
@@ -364,23 +364,23 @@ class _Change(NamedTuple):
         ]
         return cls(sides, (behind, before), first, ends, (depths[1] < depths[0]).astype(np.int32))
 
-    def moves(self, near: np.ndarray) -> list[np.ndarray]:
-        """For each side the layer (B,) that moves the break if the other does not; those that cross if `near` is 2."""
-        return [np.where(near == CROSS, self.first, at) for at in self.ends]
+    def moves(self, kind: np.ndarray) -> list[np.ndarray]:
+        """For each side the layer (B,) that moves the crossing if the other does not; of INTERSECT, those that do."""
+        return [np.where(kind == INTERSECT, self.first, at) for at in self.ends]
 
-    def parts(self, near: np.ndarray) -> np.ndarray:
-        """(B, 2) int32, the part that moves the break and what is seen behind it, or those that cross, by sides."""
-        at = np.where(near == CROSS, self.first, np.where(near == BEHIND_ENDS, self.ends[1], self.ends[0]))
+    def parts(self, kind: np.ndarray) -> np.ndarray:
+        """(B, 2) int32, the part that moves the crossing and what is behind it, or those that intersect, by sides."""
+        at = np.where(kind == INTERSECT, self.first, np.where(kind == BEHIND_ENDS, self.ends[1], self.ends[0]))
         return np.stack([side.of_layer(at).part for side in self.sides], 1)
 
-    def depth(self, near: np.ndarray) -> np.ndarray:
-        """(B,) the depth of the surface that ends, or of one that crosses another."""
-        depths = [side.of_layer(at).depth for side, at in zip(self.sides, self.moves(near), strict=True)]
-        return np.where(near == BEHIND_ENDS, depths[1], depths[0])
+    def depth(self, kind: np.ndarray) -> np.ndarray:
+        """(B,) the depth of the surface that ends, or of one that intersects another."""
+        depths = [side.of_layer(at).depth for side, at in zip(self.sides, self.moves(kind), strict=True)]
+        return np.where(kind == BEHIND_ENDS, depths[1], depths[0])
 
     def classified(self, found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[np.ndarray, np.ndarray]:
-        """`near` (B,) and `slope` (B, 2, 2) of breaks."""
-        near, slope = self.near.copy(), np.zeros((len(self.near), 2, 2))
+        """`kind` (B,) and `slope` (B, 2, 2) of crossings."""
+        kind, slope = self.kind.copy(), np.zeros((len(self.kind), 2, 2))
         a, b = (side.of_layer(self.first) for side in self.sides)
         level = np.abs(b.depth - a.depth) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth))
         meets = np.flatnonzero((a.part >= 0) & (b.part >= 0) & (a.part != b.part) & level)
@@ -388,10 +388,10 @@ class _Change(NamedTuple):
             slopes = _sampled_slopes(found.at(meets), self.first[meets], gaps, oracle)
             turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
             there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
-            near[meets[there]], slope[meets[there]] = CROSS, slopes[there]
-        return near, slope
+            kind[meets[there]], slope[meets[there]] = INTERSECT, slopes[there]
+        return kind, slope
 
-    def stacks(self, near: np.ndarray, points: np.ndarray, inner: np.ndarray) -> Stacks:
+    def stacks(self, kind: np.ndarray, points: np.ndarray, inner: np.ndarray) -> Stacks:
         """The stacks; layers that go on are sampled once, at `points` (B, 2, 2), others at `inner` (B, 2, 2)."""
         (a, b), (behind, before), layers = self.sides, self.goes_on, len(self.goes_on[0])
         lone = (b.part >= 0) & (before < 0)
@@ -407,9 +407,11 @@ class _Change(NamedTuple):
         at = np.where((behind >= 0)[..., None], points[:, 0], inner[:, 0])
         at = np.concatenate([at, np.broadcast_to(inner[:, 1], (layers, *inner[:, 1].shape))])
         numbers = [_numbers(side.part) for side in self.sides]
-        moves = np.stack([np.take_along_axis(n, m[None], 0)[0] for n, m in zip(numbers, self.moves(near), strict=True)])
+        moves = np.stack([np.take_along_axis(n, m[None], 0)[0] for n, m in zip(numbers, self.moves(kind), strict=True)])
         numbers = np.concatenate([moves, np.take_along_axis(np.concatenate(numbers), order, 0)])
-        last = np.where((near[:, None] == CROSS) | (near[:, None] == [BEFORE_ENDS, BEHIND_ENDS]), self.parts(near), -1)
+        last = np.where(
+            (kind[:, None] == INTERSECT) | (kind[:, None] == [BEFORE_ENDS, BEHIND_ENDS]), self.parts(kind), -1
+        )
         part = np.take_along_axis(part, order, 0)
         at = np.take_along_axis(at, order[..., None], 0)
         return Stacks(last, part.T, np.full(part.T.shape, -1), at.transpose(1, 0, 2), sides, numbers.T)
@@ -437,7 +439,7 @@ def _sampled_slopes(found: _Intervals, layer: np.ndarray, gaps: _Lines, oracle: 
     return slopes
 
 
-def _depth_of(front: Fronts, number: np.ndarray, layers: Fronts) -> np.ndarray:
+def _depth_of(front: Hits, number: np.ndarray, layers: Hits) -> np.ndarray:
     """The depth (M,) of the layer of a front's part with as many of the same part before it; NaN if there is none."""
     same = (layers.part == front.part) & (_numbers(layers.part) == number)
     return np.where(same.any(0), layers.of_layer(same.argmax(0)).depth, np.nan)

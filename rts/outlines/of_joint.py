@@ -1,6 +1,6 @@
 """Scenes of triangles: all samples and the stencil, found on the host in one table.
 
-A part's rows are those at centres, then those beside breaks, so that nothing is numbered anew.
+A part's rows are those at centres, then those beside crossings, so that nothing is numbered anew.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 
 from rts.compiling.threads import parallel
 from rts.contracts.records import Cells, Fragments, Sampled
-from rts.outlines.beside import Beside, breaks_of_sheets, limited
-from rts.outlines.found import Outlines, Told, fits
-from rts.outlines.gaps import Fronts
-from rts.outlines.sheets import Sheets
+from rts.outlines.beside import Beside, crossings_of_meshes, limited
+from rts.outlines.found import Outlines, Required, fits
+from rts.outlines.gaps import Hits
+from rts.outlines.seen_mesh import SeenMesh
 from rts.sampling.camera_checks import on_host
 from rts.sampling.joint import Joint, is_suited
 from rts.sampling.points import pixel_widths
@@ -48,42 +48,42 @@ class AtOnce:
         part, triangle, depth = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, np.float32)
         owners, seen = packing_loops.owners_of(self._joint.starts), self._fragments[::2]
         known = *seen, owners, self._opaque, part, triangle, depth
-        parallel(samples_loops.fronts, shape[1], *known, work=3 * part.size)
+        parallel(samples_loops.hits, shape[1], *known, work=3 * part.size)
         return Sampled((), Cells(part, depth, triangle), np.zeros((), np.int32))
 
     def found(
-        self, seen: Sampled, told: Told | None, real: Any, uniform: bool = False, most: int | None = None
+        self, seen: Sampled, required: Required | None, real: Any, uniform: bool = False, most: int | None = None
     ) -> Sampled:
-        """The samples at centres, those beside breaks, and the stencil.
+        """The samples at centres, those beside crossings, and the stencil.
 
         Args:
             seen: what `centres` gave last, or its first layers, or fewer cells.
-            told: what samples beside breaks have to tell; None for none, and no stencil.
+            required: what samples beside crossings have to tell; None for none, and no stencil.
             real: the dtype of weights.
             uniform: whether one sample stands for all cells of a part, of one layer.
-            most: the breaks for whose stencil there is room; None for any. `overflow` counts those left out.
+            most: the crossings for whose stencil there is room; None for any. `overflow` counts those left out.
         """
-        if told is None:
+        if required is None:
             return self._sampled(seen, None, uniform)[0]
         joint, size, count = self._joint, self._grid.size, most
-        sheets = Sheets.of(
-            joint.proxy, joint.camera, size, "none", 0, joint.proxies, seams=told.colors, keep=joint.signs
+        meshes = SeenMesh.of(
+            joint.proxy, joint.camera, size, "none", 0, joint.proxies, seams=required.colors, keep=joint.signs
         )
         width = pixel_widths(on_host(self._grid.camera).for_size(size), size)
-        layers = Fronts(seen.row, seen.triangle, seen.depth.astype(np.float64))
-        find = partial(breaks_of_sheets, layers, self._opaque, (sheets,), width)
+        layers = Hits(seen.row, seen.triangle, seen.depth.astype(np.float64))
+        find = partial(crossings_of_meshes, layers, self._opaque, (meshes,), width)
         while True:
-            breaks, stacks, left = limited(find, count, told.colors)
-            wanted, sides = Beside.of(breaks, stacks, told), None if stacks is None else stacks.sides
-            sampled, rows = self._sampled(seen, sheets.at(wanted.triangle, wanted.points), uniform)
-            outlines = Outlines.of(breaks, wanted.table(len(breaks.gap), rows), sides, left)
-            stencil = outlines.stencil(sampled.row, told, real)
+            crossings, stacks, left_out = limited(find, count, required.colors)
+            wanted, sides = Beside.of(crossings, stacks, required), None if stacks is None else stacks.sides
+            sampled, rows = self._sampled(seen, meshes.at(wanted.triangle, wanted.points), uniform)
+            outlines = Outlines.of(crossings, wanted.table(len(crossings.gap), rows), sides, left_out)
+            stencil = outlines.stencil(sampled.row, required, real)
             if fits(stencil, most) or not count:
-                return replace(sampled, stencil=stencil, overflow=seen.overflow + np.int32(left))
-            count = min(count, len(breaks.gap)) // 2
+                return replace(sampled, stencil=stencil, overflow=seen.overflow + np.int32(left_out))
+            count = min(count, len(crossings.gap)) // 2
 
     def _sampled(self, seen: Sampled, beside: Fragments | None, uniform: bool) -> tuple[Sampled, np.ndarray]:
-        """The samples at centres, and those of fragments (1, 1, M) beside breaks, whose rows (M,) are told."""
+        """The samples at centres, and those of fragments (1, 1, M) beside crossings, whose rows (M,) are told."""
         from rts.sampling import packing_loops
 
         joint, part = self._joint, seen.row

@@ -16,12 +16,12 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Outlines, Told, arrays_of, fits, specs
+from rts.outlines.found import Outlines, Required, arrays_of, fits, specs
 from rts.outlines.points import Points, at_centres, has_pairs
 from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
 from rts.sampling.picture import renumbered
-from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.scene import Grid, Scene, lies_on_triangles
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 
@@ -30,10 +30,10 @@ def with_outlines(
     sampled: Sampled,
     scene: Scene,
     grid: Grid,
-    told: Told,
+    required: Required,
     capacity: int | None = None,
 ) -> Sampled:
-    """Samples at cells' centres with `Sampled.stencil` and the samples beside breaks.
+    """Samples at cells' centres with `Sampled.stencil` and the samples beside crossings.
 
     Where light passes through, the outlines are those of all layers that it reaches; else those of the first layer.
 
@@ -41,9 +41,9 @@ def with_outlines(
         sampled: the samples at centres.
         scene: the scene.
         grid: the cells.
-        told: what samples beside breaks have to tell.
-        capacity: `Request.capacity`. Where values are traced, there is room for `most_breaks`, or for fewer if a shared
-            table has no room for their samples. `overflow` counts those beyond.
+        required: what samples beside crossings have to tell.
+        capacity: `Request.capacity`. Where values are traced, there is room for `most_crossings`, or for fewer if a
+            shared table has no room for their samples. `overflow` counts those beyond.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
@@ -60,18 +60,18 @@ def with_outlines(
         inputs = stopped((known, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
     if traced or any(map(is_batched, leaves(inputs))):
-        room = most_breaks(grid, capacity) if traced else None
-        return _found_on_host(sampled, scene, grid, room, capacity, told, inputs)
-    points, cells = Points.of(scene, grid, inputs_of(scene), told), map_leaves(host_value, sampled.cells)
+        room = most_crossings(grid, capacity) if traced else None
+        return _found_on_host(sampled, scene, grid, room, capacity, required, inputs)
+    points, cells = Points.of(scene, grid, inputs_of(scene), required), map_leaves(host_value, sampled.cells)
     found, parts, more = points.outlines(at_centres(cells, sampled.samples))
     samples, places = _joined(sampled.samples, more, _used(found.rows, parts, len(more)))
     row = cells.row if len(samples) == 1 else places.of_centres()[cells.row]
-    stencil = _over_parts(found, parts, places.beside).stencil(row, told, real)
+    stencil = _over_parts(found, parts, places.beside).stencil(row, required, real)
     if len(samples) > 1:
         row = engine_of(sampled.row).constant(row, sampled.row)
         sampled = replace(sampled, cells=replace(sampled.cells, row=row))
     # Engines that compile eager operations anew for each shape pad them.
-    engine, overflow, cells = engine_of(sampled.row), sampled.overflow + np.int32(found.left), sampled.cells
+    engine, overflow, cells = engine_of(sampled.row), sampled.overflow + np.int32(found.left_out), sampled.cells
     if engine.differentiates:
         arrays, layers = arrays_of(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
         stencil = Stencil(*engine.call_host(lambda _: arrays, specs(0, grid.size, real, layers), sampled.row))
@@ -85,7 +85,7 @@ class _Places(NamedTuple):
     Attributes:
         counts: (P,) the numbers of samples at centres.
         centres: (P,) int32, the index of each part's first sample at a centre.
-        beside: (P,) int32, that of its first sample beside a break.
+        beside: (P,) int32, that of its first sample beside a crossing.
     """
 
     counts: np.ndarray
@@ -112,7 +112,7 @@ def _used(rows: np.ndarray, parts: np.ndarray, count: int) -> np.ndarray:
 
 
 def _joined(centres: Sequence[Samples], beside: Sequence[Samples], used: Any) -> tuple[tuple[Samples, ...], _Places]:
-    """The samples of each part, those at centres and then those beside breaks, of which so many are `used`."""
+    """The samples of each part, those at centres and then those beside crossings, of which so many are `used`."""
     samples, counts, firsts, first = [], [], [], 0
     for of_cells, extra, last in zip(centres, beside, used, strict=True):
         whole = in_one_table([of_cells, extra])
@@ -126,8 +126,8 @@ def _joined(centres: Sequence[Samples], beside: Sequence[Samples], used: Any) ->
     return tuple(samples), _Places(counts, firsts, firsts + counts.astype(np.int32))
 
 
-def most_breaks(grid: Grid, capacity: int | None) -> int:
-    """The number of breaks for which programs of fixed shapes have room, given `Request.capacity`."""
+def most_crossings(grid: Grid, capacity: int | None) -> int:
+    """The number of crossings for which programs of fixed shapes have room, given `Request.capacity`."""
     return max(8 * sum(grid.size), (capacity or 0) // 4)
 
 
@@ -149,16 +149,16 @@ def _found_on_host(
     grid: Grid,
     most: int | None,
     capacity: int | None,
-    told: Told,
+    required: Required,
     inputs: Tree,
 ) -> Sampled:
-    """See `with_outlines`; by a call to the host, with room for `most` breaks, and with the `inputs` from there."""
+    """See `with_outlines`; by a call to the host, with room for `most` crossings, and with the `inputs` from there."""
     owners, layers, real = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0], real_of(scene)
     room = [
-        _Room.of(part, sampler, samples, layers, told, most, capacity)
+        _Room.of(part, sampler, samples, layers, required, most, capacity)
         for part, sampler, samples in zip(scene.parts, scene.samplers, sampled.samples, strict=True)
     ]
-    # The host does not know how many samples beside breaks there will be: there is room for the most between parts.
+    # The host does not know how many samples beside crossings there will be: there is room for the most between parts.
     counts = np.array([samples.ids.shape[-2] for samples in sampled.samples])
     total, parts = counts.sum(), len(counts)
     each = (2**31 - 1 - total) // parts if most is None else max(own.rows for own in room)
@@ -173,15 +173,15 @@ def _found_on_host(
             cameras=[seen for seen, *_ in of_parts],
             context=Context(engine_of(), None),
         )
-        points = Points.of(here, Grid(camera, grid.size), [x for *_, x in of_parts], told)
+        points = Points.of(here, Grid(camera, grid.size), [x for *_, x in of_parts], required)
         centres, count = at_centres(cells, sampled.samples), most
         while True:
             found, of_rows, more = points.outlines(centres, count)
-            stencil = _over_parts(found, of_rows, beside).stencil(cells.row, told, real)
+            stencil = _over_parts(found, of_rows, beside).stencil(cells.row, required, real)
             if not count or (fits(stencil, most) and all(own.holds(x) for own, x in zip(room, more, strict=True))):
                 break
             count = min(count, len(found.place)) // 2
-        results = [*arrays_of(stencil), _used(found.rows, of_rows, parts), found.left]
+        results = [*arrays_of(stencil), _used(found.rows, of_rows, parts), found.left_out]
         for part, samples, tables in zip(here.parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = (
@@ -202,7 +202,7 @@ def _found_on_host(
     at_once = all(map(_samples_at_once, scene.parts, scene.samplers))
     call = OnAllCores(host) if at_once else host
     results = iter(engine_of(sampled.row, *operands).call_host(call, of_results, *operands))
-    stencil, used, left = Stencil(*islice(results, fields)), next(results), next(results)
+    stencil, used, left_out = Stencil(*islice(results, fields)), next(results), next(results)
     more = [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
     samples, places = _joined(sampled.samples, more, [used[part] for part in range(parts)])
     cells = replace(sampled.cells, triangle=None)
@@ -212,16 +212,16 @@ def _found_on_host(
         starts, shifts = before[None].astype(np.int32), shifts[None].astype(np.int32)
         stencil = stencil.with_samples(lambda rows: renumbered(rows, starts, shifts))
         cells = replace(cells, row=renumbered(cells.row, starts, shifts))
-    return replace(sampled, samples=samples, cells=cells, stencil=stencil, overflow=sampled.overflow + left)
+    return replace(sampled, samples=samples, cells=cells, stencil=stencil, overflow=sampled.overflow + left_out)
 
 
 def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
     """True if several threads may sample points of a part at once."""
-    return has_sheets(part, sampler) and isinstance(sampler, TriangleSampler) and sampler.draws_at_once
+    return lies_on_triangles(part, sampler) and isinstance(sampler, TriangleSampler) and sampler.draws_at_once
 
 
 class _Room(NamedTuple):
-    """The room for samples of a part beside breaks.
+    """The room for samples of a part beside crossings.
 
     Attributes:
         rows: the largest number of these samples.
@@ -238,14 +238,14 @@ class _Room(NamedTuple):
         sampler: Sampler,
         samples: Samples,
         layers: int,
-        told: Told,
+        required: Required,
         most: int | None,
         capacity: int | None,
     ) -> _Room:
-        """Room for the samples of at most so many breaks, in addition to `samples` of the part at centres."""
+        """Room for the samples of at most so many crossings, in addition to `samples` of the part at centres."""
         # Where there is a pair, one of the last samples is there again.
-        of_pairs, surface = 3 if layers == 1 and told.motions and has_pairs(part, sampler) else 0, part.surface
-        each = told.samples(layers) + of_pairs
+        of_pairs, surface = 3 if layers == 1 and required.motions and has_pairs(part, sampler) else 0, part.surface
+        each = required.samples(layers) + of_pairs
         rows, names = each * (most or 0), set(samples.tables) - set(samples.by_sample)
         if not names or not isinstance(surface, TriangleSurface):
             return cls(rows, {})

@@ -17,9 +17,9 @@ from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Told, arrays_of, fits, specs
+from rts.outlines.found import Required, arrays_of, fits, specs
 from rts.outlines.of_joint import AtOnce
-from rts.outlines.of_scene import most_breaks
+from rts.outlines.of_scene import most_crossings
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
 from rts.sampling.host_scenes import from_values, real_of, values_of
@@ -30,18 +30,18 @@ from rts.sampling.side_by_side import DrawnView, joined
 
 
 def sampled_by_one_call(
-    scene: Scene, grid: Grid, layers: int, told: Told, uniform: bool, capacity: int | None
+    scene: Scene, grid: Grid, layers: int, required: Required, uniform: bool, capacity: int | None
 ) -> Sampled | None:
     """The samples of a scene whose values are not at hand, with their outlines, by one call to the host.
 
     The cells of each part's samples are its rows, one after the other, −1 for those that are not in use. Samples beyond
-    `capacity` in a part, and breaks beyond `most_breaks`, are dropped, and counted in `overflow`.
+    `capacity` in a part, and crossings beyond `most_crossings`, are dropped, and counted in `overflow`.
 
     Args:
         scene: the scene.
         grid: the cells.
         layers: K.
-        told: as of `with_outlines`.
+        required: as of `with_outlines`.
         uniform: as of `AtOnce.found`.
         capacity: as of `Request`.
 
@@ -57,7 +57,7 @@ def sampled_by_one_call(
     padded = scene.context.like is not None and engine.padded(scene.context.like)
     if not traced and not padded and not any(map(is_batched, operands)):
         return None
-    return _Call(scene, grid, layers, told, uniform, capacity, values, traced).sampled(operands)
+    return _Call(scene, grid, layers, required, uniform, capacity, values, traced).sampled(operands)
 
 
 class _Call:
@@ -72,7 +72,7 @@ class _Call:
         scene: Scene,
         grid: Grid,
         layers: int,
-        told: Told,
+        required: Required,
         uniform: bool,
         capacity: int | None,
         values: Any,
@@ -83,13 +83,13 @@ class _Call:
         camera = scene.camera.map(lambda _: np.eye(4))  # Not read: that of the cells is among the values.
         self._scene = scene._replace(parts=parts, camera=camera, cameras=[], context=self._context)
         self._size = grid.size
-        self._layers, self._told = layers, told
+        self._layers, self._required = layers, required
         self._values = map_leaves(lambda x: x if type(x) is np.ndarray else 0.0, values)
         self._capacity, self._uniform = capacity, uniform
-        self._most = most_breaks(grid, capacity) if traced else None
+        self._most = most_crossings(grid, capacity) if traced else None
         kept = 1 if all(scene.opaque) else layers
         cells = 1 if uniform else layers * grid.size[0] * grid.size[1]
-        beside = (self._most or 0) * told.samples(layers)
+        beside = (self._most or 0) * required.samples(layers)
         rows = beside + (cells if capacity is None else min(cells, capacity))
         # Without fixed shapes there is no bound.
         self._rows = rows if traced else (2**31 - 1) // len(scene.parts)
@@ -148,11 +148,11 @@ class _Call:
         return self._results([self._found(AtOnce(Joint.of(scene, grid), grid, scene.opaque), self._most)])[0]
 
     def _found(self, at_once: AtOnce, most: int | None) -> Sampled:
-        """The samples, at most `capacity` of each part at centres, and the stencil of at most `most` breaks."""
+        """The samples, at most `capacity` of each part at centres, and the stencil of at most `most` crossings."""
         seen = at_once.centres(self._layers)
         if not self._uniform and self._capacity is not None:
             seen = _limited(seen, self._capacity)
-        return at_once.found(seen, self._told, real_of(self._scene), self._uniform, most)
+        return at_once.found(seen, self._required, real_of(self._scene), self._uniform, most)
 
     def _several(self, items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray] | None]:
         """The results of several items; None for those that cannot be drawn along with others, or lack room."""

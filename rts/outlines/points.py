@@ -1,4 +1,4 @@
-"""A scene sampled at single points: its fronts there, the breaks between them, and the samples beside breaks."""
+"""A scene sampled at single points: hits there, the crossings between them, and the samples beside these."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
-from rts.outlines.beside import Beside, breaks_of_sheets, limited
-from rts.outlines.edge_kinds import BEHIND_ENDS, CROSS
-from rts.outlines.found import Outlines, Told
-from rts.outlines.gaps import Breaks, Fronts, Gaps, Stacks
-from rts.outlines.halving import Hints, Oracle, find_breaks
-from rts.outlines.sheets import Sheets
+from rts.outlines.beside import Beside, crossings_of_meshes, limited
+from rts.outlines.edge_kinds import BEHIND_ENDS, INTERSECT
+from rts.outlines.found import Outlines, Required
+from rts.outlines.gaps import Crossings, Gaps, Hits, Stacks
+from rts.outlines.halving import Hints, Oracle, find_crossings
+from rts.outlines.seen_mesh import SeenMesh
 from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.sampling.camera_checks import on_host
 from rts.sampling.entries import entry_of
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
-from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.scene import Grid, Scene, lies_on_triangles
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -36,73 +36,73 @@ from rts.scene.camera import Camera
 class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
-    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], told: Told):
-        """Take of each part its sampler, camera, entry and, where triangles tell all, sheets."""
-        self._scene, self._grid, self._parts, self._told = scene, grid, parts, told
+    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], required: Required):
+        """Take of each part its sampler, camera, entry and, where triangles tell all, patches."""
+        self._scene, self._grid, self._parts, self._required = scene, grid, parts, required
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree], told: Told) -> Points:
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree], required: Required) -> Points:
         """The points of a grid.
 
         Args:
             scene: the scene.
             grid: its cells.
             inputs: of each part's proxy, on the host; read where the part has no entry.
-            told: what samples have to tell.
+            required: what samples have to tell.
         """
         parts = []
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
-            camera, sheets = scene.local_camera(index, grid), None
+            camera, meshes = scene.local_camera(index, grid), None
             if isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
-                if has_sheets(part, sampler):
+                if lies_on_triangles(part, sampler):
                     seen = entry.proxy.seen_by(host)
-                    sheets = Sheets.of(entry.proxy, seen, grid.size, part.cull, index, seams=told.colors)
-            parts.append((sampler, camera, entry, sheets))
-        return cls(scene, grid, parts, told)
+                    meshes = SeenMesh.of(entry.proxy, seen, grid.size, part.cull, index, seams=required.colors)
+            parts.append((sampler, camera, entry, meshes))
+        return cls(scene, grid, parts, required)
 
-    def outlines(self, layers: Fronts, most: int | None = None) -> tuple[Outlines, np.ndarray, list[Samples]]:
-        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; and their samples, by part.
+    def outlines(self, layers: Hits, most: int | None = None) -> tuple[Outlines, np.ndarray, list[Samples]]:
+        """Outlines between what is seen at centres (K, H, W), of at most `most` crossings; and their samples, by part.
 
         `Outlines.rows` are counted in each part; in the middle there are these parts, int32, of the same shape, or −1.
         """
-        breaks, stacks, left = limited(functools.partial(self._breaks, layers), most, self._told.colors)
-        wanted, samples = Beside.of(breaks, stacks, self._told), []
+        crossings, stacks, left_out = limited(functools.partial(self._crossings, layers), most, self._required.colors)
+        wanted, samples = Beside.of(crossings, stacks, self._required), []
         found = np.empty(len(wanted.part), np.int32)
         for part in range(len(self._parts)):
             (inside,) = (wanted.part == part).nonzero()
             points = wanted.points[inside]
-            fragments = self._on_sheets(part, points, wanted.triangle[inside])
+            fragments = self._on_triangles(part, points, wanted.triangle[inside])
             one, found[inside] = self._of_layers(part, points, wanted.number[inside], fragments)
             samples.append(one)
-        rows, parts = (wanted.table(len(breaks.gap), x) for x in (found, wanted.part))
+        rows, parts = (wanted.table(len(crossings.gap), x) for x in (found, wanted.part))
         if stacks is None:
-            rows[:, 4:], parts[:, 4:] = self._pairs(breaks, samples)
-        return Outlines.of(breaks, rows, None if stacks is None else stacks.sides, left), parts, samples
+            rows[:, 4:], parts[:, 4:] = self._pairs(crossings, samples)
+        return Outlines.of(crossings, rows, None if stacks is None else stacks.sides, left_out), parts, samples
 
-    def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
+    def _pairs(self, crossings: Crossings, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs beside the deepest points of rays at crossings, rows (B, 2) of their parts, or −1; these parts (B, 2).
 
         They are added to the samples of parts.
         """
-        part = np.where(breaks.near == BEHIND_ENDS, breaks.parts[:, 1], breaks.parts[:, 0])
-        part[breaks.near == CROSS] = -1
+        part = np.where(crossings.kind == BEHIND_ENDS, crossings.parts[:, 1], crossings.parts[:, 0])
+        part[crossings.kind == INTERSECT] = -1
         rows = np.full((len(part), 2), -1, np.int32)
-        if not self._told.motions:
+        if not self._required.motions:
             part[:] = -1
         for index, known in enumerate(self._parts):
             if not has_pairs(self._scene.parts[index], known[0]):
                 continue
-            points, triangles = breaks.points, breaks.triangles
+            points, triangles = crossings.points, crossings.triangles
             at = np.flatnonzero(part == index)
             if not len(at):
                 continue
-            ending, drawn = (at, breaks.near[at]), isinstance(known[0], TriangleSampler)
-            fragments = self._on_sheets(index, points[ending], triangles[ending]) if drawn else None
+            ending, drawn = (at, crossings.kind[at]), isinstance(known[0], TriangleSampler)
+            fragments = self._on_triangles(index, points[ending], triangles[ending]) if drawn else None
             more = self._sample(index, points[ending], fragments, pairs=True)
             if more.pair is not None:
                 found = host_value(more.pair).T[: len(at)]
@@ -110,50 +110,50 @@ class Points:
             samples[index] = in_one_table([samples[index], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
 
-    def _breaks(self, layers: Fronts, seams: bool) -> tuple[Breaks, Stacks | None]:
-        """All breaks, with those at seams, if they are wanted; and stacks there, of several layers."""
-        sheets, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
+    def _crossings(self, layers: Hits, seams: bool) -> tuple[Crossings, Stacks | None]:
+        """All crossings, with those at seams, if they are wanted; and stacks there, of several layers."""
+        meshes, opaque = [mesh for *_, mesh in self._parts], np.array(self._scene.opaque)
         count = len(layers.part)
         layers = layers if count == 1 else _lit(layers, opaque)
-        if None not in sheets:
-            return breaks_of_sheets(layers, opaque, sheets, self._width, seams)
+        if None not in meshes:
+            return crossings_of_meshes(layers, opaque, meshes, self._width, seams)
         oracle = Oracle(functools.partial(self._layers, count=count), self._width)
-        breaks, stacks = find_breaks(layers, oracle, self._hints(layers))
-        return breaks, stacks if count > 1 else None
+        crossings, stacks = find_crossings(layers, oracle, self._hints(layers))
+        return crossings, stacks if count > 1 else None
 
-    def _hints(self, layers: Fronts) -> Hints | None:
+    def _hints(self, layers: Hits) -> Hints | None:
         """Places in gaps where triangles are whose silhouettes lie there, though surfaces may be a little beside them.
 
         Of one layer, silhouettes behind what both centres see do not count.
         """
-        several: list[Sheets] = []
-        for index, (sampler, camera, entry, sheet) in enumerate(self._parts):
-            if sheet is None and isinstance(sampler, TriangleSampler):
+        several: list[SeenMesh] = []
+        for index, (sampler, camera, entry, mesh) in enumerate(self._parts):
+            if mesh is None and isinstance(sampler, TriangleSampler):
                 host, cull = on_host(camera.for_size(self._grid.size)), self._scene.parts[index].cull
-                sheet = Sheets.of(entry.proxy, entry.proxy.seen_by(host), self._grid.size, cull, index)
-            if sheet is not None:
-                several.append(sheet)
+                mesh = SeenMesh.of(entry.proxy, entry.proxy.seen_by(host), self._grid.size, cull, index)
+            if mesh is not None:
+                several.append(mesh)
         if not several:
             return None
-        front = Fronts(*(x[0] for x in layers))
+        front = Hits(*(x[0] for x in layers))
         if len(layers.part) > 1:
             front = front._replace(part=np.full_like(front.part, -1))
         met = np.zeros((2, *front.part.shape), np.uint8)
-        for sheet in several:
-            sheet.meet(front, self._width, met)
+        for mesh in several:
+            mesh.mark_silhouettes(front, self._width, met)
         gaps = Gaps.of(met == 2)
         if not len(gaps.gap):
             return None
-        found = [sheet.spans(gaps, False)[:2] for sheet in several]
+        found = [mesh.spans(gaps, False)[:2] for mesh in several]
         names, spans = (np.concatenate(x) for x in zip(*found, strict=True))
         low, high = np.clip(spans[:, 0], 0, 1), np.clip(spans[:, 1], 0, 1)
         there = np.flatnonzero((names[:, 0] >= 0) & (high > low))
         return Hints(gaps.gap[names[there, 0]], (low[there] + high[there]) / 2)
 
-    def _on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
+    def _on_triangles(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
-        sheets = self._parts[part][-1]
-        return sheets.at(triangles, points) if sheets is not None and (triangles >= 0).all() else None
+        meshes = self._parts[part][-1]
+        return meshes.at(triangles, points) if meshes is not None and (triangles >= 0).all() else None
 
     def _of_layers(
         self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None
@@ -179,13 +179,13 @@ class Points:
         layers: int = 1,
     ) -> Samples:
         """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
-        (sampler, camera, entry, sheets), checked = self._parts[part], self._scene.parts[part]
+        (sampler, camera, entry, meshes), checked = self._parts[part], self._scene.parts[part]
         if fragments is None and len(points):
             # Engines that compile eager operations for each shape get few: further rows repeat the first point.
             arrays = checked.theta, camera
             more = engine_of(*arrays).room(len(points), exemplar(*arrays)) - len(points)
             points = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
-        if not len(points) and (sheets is None or _refines(checked)):
+        if not len(points) and (meshes is None or _refines(checked)):
             # Surfaces may want a ray at least; nothing names its sample.
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:
@@ -210,7 +210,7 @@ class Points:
         row = constant(number.astype(np.int32)[:, None], samples.row)
         return taken.replace(row=row, depth=constant(depth[:, None], samples.depth))
 
-    def _layers(self, points: np.ndarray, count: int) -> Fronts:
+    def _layers(self, points: np.ndarray, count: int) -> Hits:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
         scene, none = self._scene, (count, len(points))
         part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
@@ -221,7 +221,7 @@ class Points:
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
             order = np.argsort(depth, axis=0, kind="stable")[:count]
             part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
-        fronts = Fronts(part, np.full(none, -1, np.int32), np.where(part >= 0, depth, 0.0))
+        fronts = Hits(part, np.full(none, -1, np.int32), np.where(part >= 0, depth, 0.0))
         return _lit(fronts, np.array(scene.opaque))
 
 
@@ -230,7 +230,7 @@ def has_pairs(part: CheckedPart, sampler: Sampler) -> bool:
     return not isinstance(sampler, TriangleSampler) or overrides(part.surface, "refine_outlines", TriangleSurface)
 
 
-def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
+def at_centres(cells: Cells, samples: Sequence[Samples]) -> Hits:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
     if len(samples) == 1:
         part = np.minimum(cells.row, np.int32(0))
@@ -239,10 +239,10 @@ def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
         part = np.append(owners, np.int32(-1)).take(cells.row)
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
-    return Fronts(part, triangle, cells.depth.astype(np.float64))
+    return Hits(part, triangle, cells.depth.astype(np.float64))
 
 
-def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
+def _lit(layers: Hits, opaque: np.ndarray) -> Hits:
     """The surfaces seen at points (K, ...), without what lies behind an opaque layer."""
     if not opaque.any():
         return layers

@@ -3,11 +3,11 @@
     colour of a cell      Σ over the regions into which outlines cut it: area · mean colour beside the region
     derivative of it      Σ over outlines: ∫ v · n J ds, with v the motion of the outline and J the jump of colour there
 
-A cell is four quarters, each in a square of four neighbouring centres. On the sides of a square lie breaks. From each
-break a ray leads to a hub inside, the corner of its segment or of the one that this ends at or crosses. Rays and sides
-bound regions. The region around the cell's centre has the colour of the centre's sample.
+A cell is four quarters, each in a dual cell of four neighbouring centres. On the sides of a dual cell lie crossings.
+From each crossing a ray leads to a junction inside, the corner of its segment or of the one that this ends at or
+crosses. Rays and sides bound regions. The region around the cell's centre has the colour of the centre's sample.
 
-All here is of one layer, without what changes beside breaks as surfaces slide under the outline (`_add_sides`).
+All here is of one layer, without what changes beside crossings as surfaces slide under the outline (`_add_sides`).
 """
 
 from __future__ import annotations
@@ -22,63 +22,71 @@ import numpy as np
 from rts.outlines.found import Outlines
 
 CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-"""The centres at a square's corners, x and y, clockwise; the cell of each has one quarter of the square."""
+"""The centres at a dual cell's corners, x and y, clockwise; the cell of each has one quarter of the dual cell."""
 
 Path = list[np.ndarray]
-"""Points (x, y), from a square's first centre."""
+"""Points (x, y), from a dual cell's first centre."""
 
 
 class Ray(NamedTuple):
-    """An outline from a break to the hub where it meets others.
+    """An outline from a crossing to the junction where it meets others.
 
     Attributes:
-        place: where it starts on the sides of the square, clockwise from the upper left corner: 0 to 4.
-        tie: the break.
-        side: the side of the square: 0 top, 1 right, 2 bottom, 3 left.
-        hub: the segment at whose corner it ends.
-        path: the break, a point between, and the hub; and on to another hub, if rays of both alternate.
+        place: where it starts on the sides of the dual cell, clockwise from the upper left corner: 0 to 4.
+        endpoint: the crossing.
+        side: the side of the dual cell: 0 top, 1 right, 2 bottom, 3 left.
+        junction: the segment at whose corner it ends.
+        path: the crossing, a point between, and the junction; and on to another junction, if rays of both alternate.
     """
 
     place: float
-    tie: int
+    endpoint: int
     side: int
-    hub: int
+    junction: int
     path: Path
 
 
-def rays_of(outlines: Outlines, square: tuple[int, int]) -> list[Ray]:
-    """The rays in a square, whose first corner is the cell (y, x), clockwise by where they start."""
+def rays_of(outlines: Outlines, dual: tuple[int, int]) -> list[Ray]:
+    """The rays in a dual cell, whose first corner is the cell (y, x), clockwise by where they start."""
     rays = []
-    for s in np.flatnonzero((outlines.square == square).all(axis=1)):
-        first, second = outlines.ties[s]
-        for tie, side in zip(outlines.ties[s], outlines.square_sides[s], strict=True):
-            if tie < 0 or first == second:
+    for s in np.flatnonzero((outlines.dual == dual).all(axis=1)):
+        first, second = outlines.endpoints[s]
+        for endpoint, side in zip(outlines.endpoints[s], outlines.dual_sides[s], strict=True):
+            if endpoint < 0 or first == second:
                 continue
-            y, x, along = outlines.gap[tie] - [*square, 0]
-            start = np.clip(np.array([x, y]) + outlines.place[tie] * np.array([along, 1 - along]), 0.0, 1.0)
+            y, x, along = outlines.gap[endpoint] - [*dual, 0]
+            start = np.clip(np.array([x, y]) + outlines.place[endpoint] * np.array([along, 1 - along]), 0.0, 1.0)
             place = (start[0], 1 + start[1], 3 - start[0], 4 - start[1])[side]
-            hub = int(s + outlines.hub[s])
-            rays.append(Ray(place, int(tie), int(side), hub, [start, outlines.corner[s], outlines.corner[hub]]))
-    return _merged(sorted(rays, key=lambda ray: (ray.side, ray.place, ray.tie if ray.side < 2 else -ray.tie)), outlines)
+            junction = int(s + outlines.junction[s])
+            rays.append(
+                Ray(place, int(endpoint), int(side), junction, [start, outlines.corner[s], outlines.corner[junction]])
+            )
+    return _merged(
+        sorted(rays, key=lambda ray: (ray.side, ray.place, ray.endpoint if ray.side < 2 else -ray.endpoint)), outlines
+    )
 
 
 def _merged(rays: list[Ray], outlines: Outlines) -> list[Ray]:
-    """The rays, where those of hubs that alternate around the square end at one hub."""
+    """The rays, where those of junctions that alternate around the dual cell end at one junction."""
     for i, ray in enumerate(rays):
-        if ray.hub not in (before := [other.hub for other in rays[:i]]):
+        if ray.junction not in (before := [other.junction for other in rays[:i]]):
             continue
-        last = i - 1 - before[::-1].index(ray.hub)
-        crossing = {other.hub for other in rays[last + 1 : i]} & {other.hub for other in [*rays[:last], *rays[i + 1 :]]}
-        for hub in crossing - {ray.hub}:
-            end = outlines.corner[ray.hub]
-            rays = [x._replace(hub=ray.hub, path=[*x.path, end]) if x.hub == hub else x for x in rays]
+        last = i - 1 - before[::-1].index(ray.junction)
+        crossing = {other.junction for other in rays[last + 1 : i]} & {
+            other.junction for other in [*rays[:last], *rays[i + 1 :]]
+        }
+        for junction in crossing - {ray.junction}:
+            end = outlines.corner[ray.junction]
+            rays = [
+                x._replace(junction=ray.junction, path=[*x.path, end]) if x.junction == junction else x for x in rays
+            ]
     return rays
 
 
 def regions_of(rays: Sequence[Ray]) -> list[tuple[Path, list[tuple[int, int]]]]:
-    """The regions of a square: polygons, clockwise, and the rays that bound them, in pairs from where to where.
+    """The regions of a dual cell: polygons, clockwise, and the rays that bound them, in pairs from where to where.
 
-    A ray, by its number, comes with the side of its break that the region is on: 0 before it on its gap, 1 behind.
+    A ray, by its number, comes with the side of its crossing that the region is on: 0 before it on its gap, 1 behind.
     """
     left, regions = set(range(len(rays))), []
     while left:
@@ -89,9 +97,9 @@ def regions_of(rays: Sequence[Ray]) -> list[tuple[Path, list[tuple[int, int]]]]:
             ray, after = rays[here], (here + 1) % len(rays)
             polygon += ray.path[::-1] + _corners(ray, rays[after], after <= here) + rays[after].path
             beside += [(here, int(ray.side < 2)), (after, int(rays[after].side >= 2))]
-            # From the hub on along the ray before, counterclockwise.
+            # From the junction on along the ray before, counterclockwise.
             here = (after - 1) % len(rays)
-            while rays[here].hub != rays[after].hub:
+            while rays[here].junction != rays[after].junction:
                 here = (here - 1) % len(rays)
             if here == first:
                 break
@@ -100,13 +108,13 @@ def regions_of(rays: Sequence[Ray]) -> list[tuple[Path, list[tuple[int, int]]]]:
 
 
 def _corners(ray: Ray, after: Ray, around: bool) -> Path:
-    """The corners of the square on the way along its sides from one ray's start to the next one's."""
+    """The corners of the dual cell on the way along its sides from one ray's start to the next one's."""
     stop = after.side + (4 if around else 0)
     return [CORNERS[k % 4] for k in range(ray.side + 1, stop + 1)]
 
 
 def area_in(polygon: Path, corner: int) -> float:
-    """The area of a polygon in the quarter at a corner of its square, clockwise positive."""
+    """The area of a polygon in the quarter at a corner of its dual cell, clockwise positive."""
     low, high = CORNERS[corner] / 2, CORNERS[corner] / 2 + 0.5
     for axis in (0, 1):
         for bound, sign in ((low[axis], 1), (high[axis], -1)):
@@ -130,7 +138,7 @@ def length_in(path: Path, corner: int) -> float:
 
 
 def _cut(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The straight pieces of a path, cut where the square's quarters meet."""
+    """The straight pieces of a path, cut where the dual cell's quarters meet."""
     pieces = []
     for p, q in zip(path[:-1], path[1:], strict=True):
         cuts = [(0.5 - p[a]) / (q[a] - p[a]) for a in (0, 1) if abs(q[a] - p[a]) > 1e-9]
@@ -139,19 +147,19 @@ def _cut(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     return pieces
 
 
-def areas(outlines: Outlines, shown: np.ndarray, front: np.ndarray, cell: tuple[int, int]) -> dict[int, float]:
+def areas(outlines: Outlines, shown: np.ndarray, at_centres: np.ndarray, cell: tuple[int, int]) -> dict[int, float]:
     """The weight of each colour in a cell (y, x); −1 for nothing.
 
     Args:
         outlines: the outlines.
-        shown: (B, 2), the colours before and behind breaks, or −1.
-        front: (H, W), the colour of each cell's centre, or −1.
+        shown: (B, 2), the colours before and behind crossings, or −1.
+        at_centres: (H, W), the colour of each cell's centre, or −1.
         cell: the cell.
     """
-    weights, own = defaultdict(float), int(front[cell])
+    weights, own = defaultdict(float), int(at_centres[cell])
     for corner, (right, down) in enumerate(CORNERS.astype(int)):
-        square = cell[0] - down, cell[1] - right
-        rays = rays_of(outlines, square)
+        dual = cell[0] - down, cell[1] - right
+        rays = rays_of(outlines, dual)
         if not rays:
             weights[own] += 0.25
             continue
@@ -164,22 +172,22 @@ def areas(outlines: Outlines, shown: np.ndarray, front: np.ndarray, cell: tuple[
                 weights[own] += scale * area
                 continue
             # Of several outlines around a region each counts by its length.
-            of_hubs: dict[int, list[float]] = defaultdict(list)
+            of_junctions: dict[int, list[float]] = defaultdict(list)
             for i, _ in beside:
-                of_hubs[rays[i].hub].append(lengths[i] + 1e-9)
-            whole = sum(map(sum, of_hubs.values()))
+                of_junctions[rays[i].junction].append(lengths[i] + 1e-9)
+            whole = sum(map(sum, of_junctions.values()))
             for i, side in beside:
-                own_lengths = of_hubs[rays[i].hub]
+                own_lengths = of_junctions[rays[i].junction]
                 share = sum(own_lengths) / whole / len(own_lengths)
-                weights[int(shown[rays[i].tie, side])] += scale * area * share
+                weights[int(shown[rays[i].endpoint, side])] += scale * area * share
     return dict(weights)
 
 
-def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tuple[int, int], np.ndarray]:
-    """By how much a cell changes: for pairs of breaks, with the jump of colour at one, per motion (x, y) of the other.
+def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tuple[int, int], np.ndarray]:
+    """By how much a cell changes: for pairs of crossings, by the jump of colour at one, per motion (x, y) of the other.
 
-    Jumps count from before a break to behind it, along its gap. From the break to the hub of its segment alone the jump
-    goes over to the mean of both ends.
+    Jumps count from before a crossing to behind it, along its gap. From the crossing to the junction of its segment
+    alone the jump goes over to the mean of both ends.
 
     Args:
         outlines: the outlines.
@@ -188,20 +196,20 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
     """
     found: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(2))
     for corner, (right, down) in enumerate(CORNERS.astype(int)):
-        square = cell[0] - down, cell[1] - right
-        segments = np.flatnonzero((outlines.square == square).all(axis=1) & (np.diff(outlines.ties)[:, 0] != 0))
-        leaders = [s + outlines.hub[s] for s in segments]
+        dual = cell[0] - down, cell[1] - right
+        segments = np.flatnonzero((outlines.dual == dual).all(axis=1) & (np.diff(outlines.endpoints)[:, 0] != 0))
+        leaders = [s + outlines.junction[s] for s in segments]
         for s in segments:
-            ties = [tie for tie in outlines.ties[s] if tie >= 0]
-            alone = len(ties) == 2 and leaders.count(s + outlines.hub[s]) == 1
-            signs = [1 if side < 2 else -1 for side in outlines.square_sides[s]]
-            for e, tie in enumerate(ties):
-                for start, end, t, motion in _pieces(outlines, int(s), e, square):
+            endpoints = [endpoint for endpoint in outlines.endpoints[s] if endpoint >= 0]
+            alone = len(endpoints) == 2 and leaders.count(s + outlines.junction[s]) == 1
+            signs = [1 if side < 2 else -1 for side in outlines.dual_sides[s]]
+            for e, endpoint in enumerate(endpoints):
+                for start, end, t, motion in _pieces(outlines, int(s), e, dual):
                     sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
                     share = np.prod(np.where(CORNERS[corner] == 1, sides, 1 - sides))
                     normal = share * np.array([end[1] - start[1], start[0] - end[0]])
-                    jumps = {tie: signs[e] * (1 - t / 2 if alone else 1)}
-                    jumps |= {ties[1 - e]: -signs[1 - e] * t / 2} if alone else {}
+                    jumps = {endpoint: signs[e] * (1 - t / 2 if alone else 1)}
+                    jumps |= {endpoints[1 - e]: -signs[1 - e] * t / 2} if alone else {}
                     _add(found, jumps, motion, normal)
     return dict(found)
 
@@ -209,24 +217,27 @@ def fluxes(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tup
 def _add(
     found: dict[tuple[int, int], np.ndarray], jumps: dict[int, float], motion: dict[int, float], normal: np.ndarray
 ) -> None:
-    """Add to fluxes those of a piece, with a normal as long as it, of each pair of a jump and a break."""
+    """Add to boundary terms those of a piece, with a normal as long as it, of each pair of a jump and a crossing."""
     for (jump, weight), (b, rate) in itertools.product(jumps.items(), motion.items()):
         found[int(jump), b] += weight * rate * normal
 
 
 def _pieces(
-    outlines: Outlines, s: int, e: int, square: tuple[int, int]
+    outlines: Outlines, s: int, e: int, dual: tuple[int, int]
 ) -> list[tuple[np.ndarray, np.ndarray, float, dict[int, float]]]:
     """The straight pieces, start and end, of the ray from end `e` of a segment; and two values for the middle of each.
 
-    These are where it lies between break and corner, 0 to 1, and its motion, as weights of those of breaks.
+    These are where it lies between crossing and corner, 0 to 1, and its motion, as weights of those of crossings.
     """
-    h = int(s + outlines.hub[s])
-    first, second = outlines.ties[s, 0], outlines.ties[s, 1] if outlines.ties[s, 1] >= 0 else outlines.ties[s, 0]
-    pulling = outlines.beyond[s, 0], *outlines.ties[s], outlines.beyond[s, 1]
+    h = int(s + outlines.junction[s])
+    first, second = (
+        outlines.endpoints[s, 0],
+        outlines.endpoints[s, 1] if outlines.endpoints[s, 1] >= 0 else outlines.endpoints[s, 0],
+    )
+    pulling = outlines.adjacent[s, 0], *outlines.endpoints[s], outlines.adjacent[s, 1]
 
     def at(b: int) -> np.ndarray:
-        y, x, along = outlines.gap[b] - [*square, 0]
+        y, x, along = outlines.gap[b] - [*dual, 0]
         return np.clip(np.array([x, y]) + outlines.place[b] * np.array([along, 1 - along]), 0.0, 1.0)
 
     last = outlines.pull[s]
@@ -234,13 +245,13 @@ def _pieces(
         middle = along = last
     else:
         # The ray runs along the segment that it ends at from where it meets that, and moves as that does.
-        ends = [at(b if b >= 0 else outlines.ties[h, 0]) for b in outlines.ties[h]]
+        ends = [at(b if b >= 0 else outlines.endpoints[h, 0]) for b in outlines.endpoints[h]]
         (t, near), (u, far) = (_nearest(end, outlines.corner[h], outlines.corner[s]) for end in ends)
         t, own = (t, 0) if near <= far else (u, 3)
         share, _ = _nearest(at(first), at(second), outlines.corner[s])
         middle = np.array([0, 1 - share, share, 0])
         along = t * last + (1 - t) * np.eye(4)[own]
-    points = at(outlines.ties[s, e]), outlines.corner[s], outlines.corner[h]
+    points = at(outlines.endpoints[s, e]), outlines.corner[s], outlines.corner[h]
     found = []
     for i, (before, behind) in enumerate(((np.eye(4)[1 + e], middle), (along, last))):
         way = points[i + 1] - points[i]
@@ -250,7 +261,7 @@ def _pieces(
             rates = (1 - t) * before + t * behind
             motion: dict[int, float] = defaultdict(float)
             for b, rate in zip(pulling, rates, strict=True):
-                if b >= 0:  # Of a loop through two breaks each pulls twice.
+                if b >= 0:  # Of a loop through two crossings each pulls twice.
                     motion[int(b)] += float(rate)
             found.append((start, end, t if i == 0 else 1.0, motion))
     return found

@@ -1,4 +1,4 @@
-"""The surfaces seen at centres, and the samples that are needed beside breaks. Compiled."""
+"""The surfaces seen at centres, and the samples that are needed beside crossings. Compiled."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from rts.compiling.loops import loop
 
 
 @loop
-def fronts(first, last, seen, depth, owners, opaque, part, triangle, deep):
-    """Fill in the fields of `Fronts` in lines `first` to `last`, from fragments; nothing behind an opaque part.
+def hits(first, last, seen, depth, owners, opaque, part, triangle, deep):
+    """Fill in the fields of `Hits` in lines `first` to `last`, from fragments; nothing behind an opaque part.
 
     Args:
         first: the first line.
@@ -35,16 +35,16 @@ def fronts(first, last, seen, depth, owners, opaque, part, triangle, deep):
 
 
 @loop
-def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, place, own, triangles, positions):
-    """List the samples beside breaks that tell colours and motions; returns their number.
+def needed(parts, ends, points, inner, of_crossings, colors, motions, centers, place, own, triangles, positions):
+    """List the samples beside crossings that tell colours and motions; returns their number.
 
     Args:
-        parts: (B, 2), as of `Breaks`.
+        parts: (B, 2), as of `Crossings`.
         ends: (B, 2).
         points: (B, 2, 2).
         inner: (B, 2, 2).
-        of_breaks: (B, 4), the triangles of these samples.
-        colors: see `Told`.
+        of_crossings: (B, 4), the triangles of these samples.
+        colors: see `Required`.
         motions: likewise.
         centers: likewise.
         place: (4 B,) int32 to fill: places in `Outlines.rows`, of two samples that tell motions and two that tell
@@ -58,15 +58,15 @@ def needed(parts, ends, points, inner, of_breaks, colors, motions, centers, plac
         for i in range(4):
             side = i % 2
             # Of one kind alone samples stand in the first two places.
-            told = i < 2 or (colors and motions and not centers)
-            if not motions and centers:  # What lies behind a break that is not the last.
-                told = i == 1 and not ends[b, 1]
-            if parts[b, side] < 0 or not told:
+            required = i < 2 or (colors and motions and not centers)
+            if not motions and centers:  # What lies behind a crossing that is not the last.
+                required = i == 1 and not ends[b, 1]
+            if parts[b, side] < 0 or not required:
                 continue
-            at_break = i < 2 if motions else centers
+            at_crossing = i < 2 if motions else centers
             place[n], own[n] = 6 * b + i, parts[b, side]
-            triangles[n] = of_breaks[b, side if at_break else 2 + side]
+            triangles[n] = of_crossings[b, side if at_crossing else 2 + side]
             for axis in range(2):
-                positions[n, axis] = points[b, side, axis] if at_break else inner[b, side, axis]
+                positions[n, axis] = points[b, side, axis] if at_crossing else inner[b, side, axis]
             n += 1
     return n

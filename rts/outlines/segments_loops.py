@@ -1,17 +1,17 @@
-"""Breaks on the sides of a square of four centres, joined into segments that do not cross within a part. Compiled."""
+"""Crossings on the sides of a dual cell, joined into segments that do not cross within a part. Compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS, SEAM
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT, SEAM
 
 LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
-"""Costs, in cells, beside the length of segments: a break that stays alone; a segment between two breaks on one side,
-which may be the two edges of something thin; one between breaks with different parts behind them; one between an
-outline and a line where surfaces cross; one between surfaces that end far from one another along the ray, of which half
-counts for those `FAR` cells apart."""
+"""Costs, in cells, beside the length of segments: a crossing that stays alone; a segment between two on one side,
+which may be the two edges of something thin; one between crossings with different parts behind them; one between an
+outline and a line where surfaces intersect; one between surfaces that end far from one another along the ray, of which
+half counts for those `FAR` cells apart."""
 
 ON_FRONT = 1.0
 """How much farther off its way, in cells, an outline counts to end at a segment on the side of what this bounds."""
@@ -30,21 +30,21 @@ CLOSE = 1e-4
 """Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
 
 ALIKE = 1e-6
-"""Distance, in cells, of two breaks that are in one place."""
+"""Distance, in cells, of two crossings that are in one place."""
 
 TIE = 1e-4
 """Difference of distances, in cells, that does not tell which of two outlines another one ends at: it is rounding."""
 
 REACH = 6
-"""The most rows from a segment to its hub."""
+"""The most rows from a segment to its junction."""
 
 MOST_ALIKE = 4
-"""The most breaks in one place: a centre is the end of so many gaps."""
+"""The most crossings in one place: a centre is the end of so many gaps."""
 
 
 @compiled(inline="always")
 def on_sides(x, y, side):
-    """The place on a square's sides, clockwise from the upper left corner, 0 to 4, of a point on one of its sides.
+    """The place on a dual cell's sides, clockwise from the upper left corner, 0 to 4, of a point on one of its sides.
 
     Sides are 0 at the top, 1 right, 2 at the bottom, 3 left; `x` and `y` count from the upper left corner.
     """
@@ -52,24 +52,25 @@ def on_sides(x, y, side):
 
 
 @loop
-def places(gap, at, near, place, kind):
-    """Fill in `Outlines.place` (B,) and `Outlines.near` (B,), from the fields of `Breaks`."""
+def places(gap, at, kind, place, kinds):
+    """Fill in `Outlines.place` (B,) and `Outlines.kind` (B,), from the fields of `Crossings`."""
     for b in range(len(gap)):
         place[b] = at[b, 0] - gap[b, 1] - 0.5 if gap[b, 2] == 1 else at[b, 1] - gap[b, 0] - 0.5
-        kind[b] = BEFORE_ENDS if near[b] == SEAM else near[b]  # There both surfaces move alike.
+        kinds[b] = BEFORE_ENDS if kind[b] == SEAM else kind[b]  # There both surfaces move alike.
 
 
 @loop
-def ends_of(gap, place, near, parts, height, width):
-    """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
+def ends_of(gap, place, kind, parts, height, width):
+    """The ends of segments: each crossing in the two dual cells beside its gap, as far as these have four centres.
 
     Returns:
-        Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
-        corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
-        the sides leaves the front, −1 where it enters it, 0 where surfaces cross and at seams; the parts in front and
-        behind. Seams have a negative number for both, by their parts, so that they are joined among themselves.
+        Flat index of the dual cell's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
+        corner, 0 to 4; and (E, 5) int32: the crossing, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way
+        along the sides leaves the front, −1 where it enters it, 0 where surfaces intersect and at seams; the parts in
+        front and behind. Seams have a negative number for both, by their parts, so that they are joined among
+        themselves.
     """
-    square, along, ends = (
+    dual, along, ends = (
         np.empty(2 * len(gap), np.int64),
         np.empty(2 * len(gap)),
         np.empty((2 * len(gap), 5), np.int32),
@@ -77,7 +78,7 @@ def ends_of(gap, place, near, parts, height, width):
     count, most = 0, np.int32(1)
     for b in range(len(gap)):
         most = max(most, parts[b, 0] + 1, parts[b, 1] + 1)
-    # Those on the sides 2 and 3, against the way of their gaps, come last and backwards: so that breaks in one place
+    # Those on the sides 2 and 3, against the way of their gaps, come last and backwards: so that crossings in one place
     # are in order clockwise.
     for n in range(2 * len(gap)):
         backwards = n >= len(gap)
@@ -86,9 +87,9 @@ def ends_of(gap, place, near, parts, height, width):
         at = place[b, 0] - x - 0.5 if row == 1 else place[b, 1] - y - 0.5
         at = min(max(at, 0.0), 1 - 1e-9)
         front, back = parts[b, 0], parts[b, 1]
-        if near[b] == BEHIND_ENDS or (near[b] == CROSS and front > back):
+        if kind[b] == BEHIND_ENDS or (kind[b] == INTERSECT and front > back):
             front, back = back, front
-        if near[b] == SEAM:
+        if kind[b] == SEAM:
             front = -2 - min(front, back) * most - max(front, back)
             back = front
         for first in range(2):
@@ -99,18 +100,18 @@ def ends_of(gap, place, near, parts, height, width):
             side = (2 if row == 1 else 1) if first == 0 else (0 if row == 1 else 3)
             if (side >= 2) != backwards:
                 continue
-            square[count] = top * width + left
+            dual[count] = top * width + left
             along[count] = on_sides(at, at, side)
-            sign = 0 if near[b] >= CROSS else (1 if near[b] == BEFORE_ENDS else -1)
+            sign = 0 if kind[b] >= INTERSECT else (1 if kind[b] == BEFORE_ENDS else -1)
             ends[count, 0], ends[count, 1], ends[count, 2] = b, side, sign if side < 2 else -sign
             ends[count, 3], ends[count, 4] = front, back
             count += 1
-    return square[:count], along[:count], ends[:count]
+    return dual[:count], along[:count], ends[:count]
 
 
 @compiled
 def _odd(first, stop, order, ends, e):
-    """True if there is an odd number of ends of the part in front of a crossing e; and of that behind it."""
+    """True if there is an odd number of ends of the part in front of an intersection e; and of that behind it."""
     odd_front, odd_back = False, False
     for m in range(first, stop):
         if ends[order[m], 2] != 0:
@@ -134,35 +135,35 @@ def turn_clockwise(order, group, along):
 
 
 @loop
-def groups_of(order, square, ends):
-    """(E,) int64: which ends of a square may be joined where light passes through: those of one part, and crossings.
+def groups_of(order, dual, ends):
+    """(E,) int64: ends of a dual cell that may be joined where light passes: those of a part, and intersections.
 
-    A crossing of two parts goes on as the outline of the one of which there is an odd number of ends, such as where
-    something opaque hides the rest; else crossings of two parts are joined among themselves. Groups are numbered as
-    their first ends come around a square, so that it has no effect which part comes first.
+    An intersection of two parts goes on as the outline of the one of which there is an odd number of ends, such as
+    where something opaque hides the rest; else intersections of two parts are joined among themselves. Groups are
+    numbered as their first ends come around a dual cell, so that it has no effect which part comes first.
 
     Args:
-        order: (E,) sorts ends by squares, in each clockwise.
-        square: (E,), see `ends_of`.
+        order: (E,) sorts ends by dual cells, in each clockwise.
+        dual: (E,), see `ends_of`.
         ends: (E, 5), see `ends_of`.
     """
     count, first = len(order), 0
-    group, kind = np.empty(count, np.int64), np.empty((count, 2), np.int32)
+    group, kinds = np.empty(count, np.int64), np.empty((count, 2), np.int32)
     while first < count:
         stop = first
-        while stop < count and square[order[stop]] == square[order[first]]:
+        while stop < count and dual[order[stop]] == dual[order[first]]:
             stop += 1
         for n in range(first, stop):
             e = order[n]
-            kind[n, 0], kind[n, 1] = ends[e, 3], -1
+            kinds[n, 0], kinds[n, 1] = ends[e, 3], -1
             if ends[e, 2] == 0:
                 odd_front, odd_back = _odd(first, stop, order, ends, e)
                 if odd_front == odd_back:
-                    kind[n, 1] = ends[e, 4]
+                    kinds[n, 1] = ends[e, 4]
                 elif odd_back:
-                    kind[n, 0] = ends[e, 4]
+                    kinds[n, 0] = ends[e, 4]
             m = first
-            while kind[m, 0] != kind[n, 0] or kind[m, 1] != kind[n, 1]:
+            while kinds[m, 0] != kinds[n, 0] or kinds[m, 1] != kinds[n, 1]:
                 m += 1
             group[e] = m
         first = stop
@@ -171,18 +172,18 @@ def groups_of(order, square, ends):
 
 @compiled(inline="always")
 def _join(begins, ends, place, tangent, cells_away, partner):
-    """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
+    """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each dual cell.
 
-    Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts cross,
-    either is in front. The least cost of
-    ends i … j of a square is found from that of shorter runs, so that no two segments cross.
+    Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts
+    intersect, either is in front. The least cost of
+    ends i … j of a dual cell is found from that of shorter runs, so that no two segments cross.
 
     Args:
-        begins: (Q + 1,) where the ends of each square begin.
-        ends: (E, 5), see `ends_of`; clockwise in each square.
-        place: (B, 2) x and y of breaks.
+        begins: (Q + 1,) where the ends of each dual cell begin.
+        ends: (E, 5), see `ends_of`; clockwise in each dual cell.
+        place: (B, 2) x and y of crossings.
         tangent: (B, 2) unit directions of outlines there, either way; 0 where they are unknown.
-        cells_away: (B,), see `Breaks.cells_away`.
+        cells_away: (B,), see `Crossings.cells_away`.
         partner: (E,) int32, filled with −1.
     """
     for q in range(len(begins) - 1):
@@ -211,7 +212,7 @@ def _cost(a, b, ends, place, tangent, cells_away):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
     other_front, other_back = ends[b, 3], ends[b, 4]
-    # A line of crossing goes on as the outline of either surface, or where either crosses a third one.
+    # A line of intersection goes on as the outline of either surface, or where either intersects a third one.
     if front != other_front and ends[a, 2] == 0 and (back == other_front or (back == other_back and not crosses)):
         front, back = back, front
     if front != other_front and ends[b, 2] == 0 and front == other_back:
@@ -248,21 +249,21 @@ def _read(first, n, step, partner):
 
 
 @loop
-def segments_of(order, group, square, ends, place, tangent, cells_away, width):
-    """The segments between ends, those of a square after those of the one before; see `outlines.segments.Segments`.
+def segments_of(order, group, dual, ends, place, tangent, cells_away, width):
+    """The segments between ends, those of a dual cell after those of the one before; see `outlines.segments.Segments`.
 
     Args:
-        order: (E,) sorts ends by squares; in each clockwise, group by group.
-        group: (E,) int64, only ends of one group are joined, which is in one square.
-        square: (E,), see `ends_of`.
+        order: (E,) sorts ends by dual cells; in each clockwise, group by group.
+        group: (E,) int64, only ends of one group are joined, which is in one dual cell.
+        dual: (E,), see `ends_of`.
         ends: (E, 5), see `ends_of`.
-        place: (B, 2) x and y of breaks.
+        place: (B, 2) x and y of crossings.
         tangent: (B, 2), see `_join`.
-        cells_away: (B,), see `Breaks.cells_away`.
+        cells_away: (B,), see `Crossings.cells_away`.
         width: number of centres in a line.
 
     Returns:
-        First corners (S, 2) of squares, ties (S, 2) and sides (S, 2), int32; and `_neighbours` of these.
+        First corners (S, 2) of dual cells, endpoints (S, 2) and sides (S, 2), int32; and `_neighbours` of these.
     """
     count = len(order)
     begins, several, sorted_ends = np.empty(count + 1, np.int64), 0, np.empty((count, 5), np.int32)
@@ -276,65 +277,65 @@ def segments_of(order, group, square, ends, place, tangent, cells_away, width):
     partner = np.full(count, -1, np.int32)
     _join(begins[: several + 1], sorted_ends, place, tangent, cells_away, partner)
     origin = np.empty((count, 2), np.int32)
-    ties, square_sides = np.full((count, 2), -1, np.int32), np.full((count, 2), -1, np.int32)
+    endpoints, dual_sides = np.full((count, 2), -1, np.int32), np.full((count, 2), -1, np.int32)
     found = 0
     for e in range(count):
         other, sign = partner[e], sorted_ends[e, 2]
-        # Of two ends the one that leaves the front comes first; of two that cross, the earlier.
+        # Of two ends the one that leaves the front comes first; of two that intersect, the earlier.
         if other >= 0:
             back = sorted_ends[other, 2]
             if not (sign > 0 or (sign == 0 and (back < 0 or (back == 0 and e < other)))):
                 continue
-        origin[found, 0], origin[found, 1] = square[order[e]] // width, square[order[e]] % width
-        ties[found, 0], square_sides[found, 0] = sorted_ends[e, 0], sorted_ends[e, 1]
+        origin[found, 0], origin[found, 1] = dual[order[e]] // width, dual[order[e]] % width
+        endpoints[found, 0], dual_sides[found, 0] = sorted_ends[e, 0], sorted_ends[e, 1]
         if other >= 0:
-            ties[found, 1], square_sides[found, 1] = sorted_ends[other, 0], sorted_ends[other, 1]
+            endpoints[found, 1], dual_sides[found, 1] = sorted_ends[other, 0], sorted_ends[other, 1]
         found += 1
-    ties = ties[:found]
-    return origin[:found], ties, square_sides[:found], _neighbours(ties, place)
+    endpoints = endpoints[:found]
+    return origin[:found], endpoints, dual_sides[:found], _neighbours(endpoints, place)
 
 
 @loop
-def ending(near, parts, triangles):
-    """(B,) int64: the triangle that ends at each break, of all parts no two alike, or −1."""
-    most, found = np.int64(-1), np.empty(len(near), np.int64)
-    for b in range(len(near)):
-        most = max(most, np.int64(triangles[b, 1 if near[b] == BEHIND_ENDS else 0]))
-    for b in range(len(near)):
-        side = 1 if near[b] == BEHIND_ENDS else 0
+def ending(kind, parts, triangles):
+    """(B,) int64: the triangle that ends at each crossing, of all parts no two alike, or −1."""
+    most, found = np.int64(-1), np.empty(len(kind), np.int64)
+    for b in range(len(kind)):
+        most = max(most, np.int64(triangles[b, 1 if kind[b] == BEHIND_ENDS else 0]))
+    for b in range(len(kind)):
+        side = 1 if kind[b] == BEHIND_ENDS else 0
         t = triangles[b, side]
         found[b] = t + parts[b, side] * (1 + most) if t >= 0 else -1
     return found
 
 
 @compiled(inline="always")
-def _neighbours(ties, place):
-    """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
+def _neighbours(endpoints, place):
+    """(S, 4) int32: the last crossing but one along the same outline, the last, the next, and the next but one; or −1.
 
-    Of breaks in one place, which an outline has that passes through a centre, one counts. `ties` (S, 2) are the ends of
-    segments, between breaks at `place` (B, 2); each break ends at most two.
+    Of crossings in one place, which an outline has that passes through a centre, one counts. `endpoints` (S, 2) are the
+    ends of segments, between crossings at `place` (B, 2); each crossing ends at most two.
     """
-    # The segments at each break, as 2 · segment + end.
+    # The segments at each crossing, as 2 · segment + end.
     at = np.full((len(place), 2), -1, np.int32)
-    for s in range(len(ties)):
+    for s in range(len(endpoints)):
         for e in range(2):
-            b = ties[s, e]
+            b = endpoints[s, e]
             if b >= 0:
                 at[b, 0 if at[b, 0] < 0 else 1] = 2 * s + e
-    found = np.full((len(ties), 4), -1, np.int32)
-    for s in range(len(ties)):
+    found = np.full((len(endpoints), 4), -1, np.int32)
+    for s in range(len(endpoints)):
         for e in range(2):
-            tie = 2 * s + e
+            endpoint = 2 * s + e
             far = 0
             for _ in range(2 * MOST_ALIKE):
-                b = ties[tie // 2, tie % 2]
+                b = endpoints[endpoint // 2, endpoint % 2]
                 if b < 0 or far == 2:
                     break
-                next_ = at[b, 1] if at[b, 0] == tie else at[b, 0]
+                next_ = at[b, 1] if at[b, 0] == endpoint else at[b, 0]
                 if next_ < 0:
                     break
-                tie = next_ + 1 - 2 * (next_ % 2)  # Its other end.
-                c = ties[tie // 2, tie % 2]
+                endpoint = next_ + 1 - 2 * (next_ % 2)  # Its other end.
+                c = endpoints[endpoint // 2, endpoint % 2]
                 if c < 0 or abs(place[c, 0] - place[b, 0]) + abs(place[c, 1] - place[b, 1]) > ALIKE:
                     found[s, (1 - far) if e == 0 else 2 + far] = c
                     far += 1
@@ -373,7 +374,7 @@ def _angle(a, b):
 
 @compiled(inline="always")
 def _inward(tangent, side):
-    """A direction, turned into a square from one of its sides; straight into it where the direction is unknown."""
+    """A direction, turned into a dual cell from one of its sides; straight into it where the direction is unknown."""
     into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
     sign = 1.0 if into >= 0 else -1.0
     if tangent[0] == 0 and tangent[1] == 0:
@@ -383,45 +384,48 @@ def _inward(tangent, side):
 
 @compiled(inline="always")
 def _within(point, origin, s):
-    """True if a point lies in the square of a segment, or `CLOSE` to it: a vertex may lie on a side, or at a centre."""
+    """True if a point lies in a segment's dual cell, or `CLOSE` to it: vertices may lie on its sides, or corners."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
     return -CLOSE <= x <= 1 + CLOSE and -CLOSE <= y <= 1 + CLOSE
 
 
 @loop
-def corners(first, last, origin, ties, square_sides, neighbours, place, tangent, triangle, corner, pull):
-    """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
+def corners(first, last, origin, endpoints, dual_sides, neighbours, place, tangent, triangle, corner, pull):
+    """Fill `corner` (S, 2), from the dual cell's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
-    at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
-    curve is two thirds as far from the chord as their meeting. At a tip, which comes back to the side
-    of the square that it entered by, the tangents are the edges of the triangles there. An outline that ends alone in
-    a square does so half across.
+    at its neighbours, it is a curve. Its tangents at the ends run as from the crossing before each to the one after;
+    the curve is two thirds as far from the chord as their meeting. At a tip, which comes back to the side
+    of the dual cell that it entered by, the tangents are the edges of the triangles there. An outline that ends alone
+    in a dual cell does so half across.
 
     Args:
         first: the first segment.
         last: the segment after the last.
-        origin: (S, 2), y and x of the first corner of each square.
-        ties: (S, 2).
-        square_sides: (S, 2), see `segments_of`.
+        origin: (S, 2), y and x of the first corner of each dual cell.
+        endpoints: (S, 2).
+        dual_sides: (S, 2), see `segments_of`.
         neighbours: (S, 4), the result of `_neighbours`.
-        place: (B, 2), x and y of breaks.
+        place: (B, 2), x and y of crossings.
         tangent: (B, 2), see `_join`.
-        triangle: (B,) int64, the triangle that ends at each break, or −1.
+        triangle: (B,) int64, the triangle that ends at each crossing, or −1.
         corner: to fill.
         pull: to fill.
     """
     for s in range(first, last):
-        start, end = _row(place, ties[s, 0]), _row(place, ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0])
+        start, end = (
+            _row(place, endpoints[s, 0]),
+            _row(place, endpoints[s, 1] if endpoints[s, 1] >= 0 else endpoints[s, 0]),
+        )
         x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-        if ties[s, 1] < 0:  # Straight into the square, as far as its middle.
-            side = square_sides[s, 0]
+        if endpoints[s, 1] < 0:  # Straight into the dual cell, as far as its middle.
+            side = dual_sides[s, 0]
             x, y = x + (0.0, -0.5, 0.0, 0.5)[side], y + (0.5, 0.0, -0.5, 0.0)[side]
         alone, on, back = 0.0, 0.0, 0.0
-        tip = ties[s, 1] >= 0 and square_sides[s, 0] == square_sides[s, 1]
+        tip = endpoints[s, 1] >= 0 and dual_sides[s, 0] == dual_sides[s, 1]
         if tip:
-            a, b = ties[s, 0], ties[s, 1]
-            way, other = _inward(_row(tangent, a), square_sides[s, 0]), _inward(_row(tangent, b), square_sides[s, 1])
+            a, b = endpoints[s, 0], endpoints[s, 1]
+            way, other = _inward(_row(tangent, a), dual_sides[s, 0]), _inward(_row(tangent, b), dual_sides[s, 1])
             curve, between = _meeting(start, way, end, (-other[0], -other[1]))
             tip = between and _within(curve, origin, s)
             share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
@@ -475,57 +479,57 @@ def _towards(start, way, a, b):
 
 @compiled(inline="always")
 def _between(at, start, end):
-    """True if a place on the sides of a square comes after `start` and before `end`, clockwise."""
+    """True if a place on the sides of a dual cell comes after `start` and before `end`, clockwise."""
     return start < at < end if start < end else at > start or at < end
 
 
 @compiled(inline="always")
-def _on_segment(origin, s, e, ties, place, corner):
-    """The end e of a segment, and its corner, from the square's first centre."""
+def _on_segment(origin, s, e, endpoints, place, corner):
+    """The end e of a segment, and its corner, from the dual cell's first centre."""
     left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
-    end = _row(place, ties[s, e])
+    end = _row(place, endpoints[s, e])
     return (end[0] - left, end[1] - top), _row(corner, s)
 
 
 @compiled(inline="always")
-def _end_at(s, other, way, origin, ties, place, clock, corner, near):
-    """Where the outline of the lone break of a segment would end at another one; see `meet`.
+def _end_at(s, other, way, origin, endpoints, place, clock, corner, kind):
+    """Where the outline of the lone crossing of a segment would end at another one; see `join_lone_ends`.
 
     Returns:
         A place on the other segment, 0 to 2, its corner at 1; how far it is off the way, and how far ahead.
     """
     best, least, nearest = 1.0, np.inf, np.inf
-    start = _on_segment(origin, s, 0, ties, place, corner)[0]
+    start = _on_segment(origin, s, 0, endpoints, place, corner)[0]
     for e in range(2):
-        end, middle = _on_segment(origin, other, e, ties, place, corner)
+        end, middle = _on_segment(origin, other, e, endpoints, place, corner)
         t, off, ahead = _towards(start, way, end, middle)
         if off < least - TIE or (off < least + TIE and ahead < nearest - TIE):
             best, least, nearest = t if e == 0 else 2 - t, off, ahead
     # What the other segment bounds lies on the right of its way, and hides what is behind on its left. Seams hide none.
-    hidden = near[ties[other, 0]] == SEAM or _between(clock[s, 0], clock[other, 0], clock[other, 1])
+    hidden = kind[endpoints[other, 0]] == SEAM or _between(clock[s, 0], clock[other, 0], clock[other, 1])
     return best, least + (0.0 if hidden else ON_FRONT), nearest
 
 
 @compiled(inline="always")
-def _apart(first, stop, s, other, ties, clock):
-    """True if a segment of the same square lies between the start of s and another one."""
+def _apart(first, stop, s, other, endpoints, clock):
+    """True if a segment of the same dual cell lies between the start of s and another one."""
     at, found = clock[s, 0], False
     for c in range(first, stop):
         low, high = min(clock[c, 0], clock[c, 1]), max(clock[c, 0], clock[c, 1])
         inside = low <= min(clock[other, 0], clock[other, 1]) and max(clock[other, 0], clock[other, 1]) <= high
         between = (at < low or at > high) if inside else low < at < high
-        found |= between and c != other and ties[c, 1] >= 0
+        found |= between and c != other and endpoints[c, 1] >= 0
     return found
 
 
 @compiled(inline="always")
-def _crossing(s, other, origin, ties, place, corner):
+def _cut_at(s, other, origin, endpoints, place, corner):
     """Where a segment crosses another one: the place on that one, 0 to 2, its corner at 1; −1 if it does not."""
     for e in range(2):
-        a, b = _on_segment(origin, other, e, ties, place, corner)
+        a, b = _on_segment(origin, other, e, endpoints, place, corner)
         piece = _minus(b, a)
         for d in range(2):
-            start, end = _on_segment(origin, s, d, ties, place, corner)
+            start, end = _on_segment(origin, s, d, endpoints, place, corner)
             way, off = _minus(end, start), _minus(a, start)
             turn = way[0] * piece[1] - way[1] * piece[0]
             if turn == 0:
@@ -537,34 +541,34 @@ def _crossing(s, other, origin, ties, place, corner):
 
 
 @compiled(inline="always")
-def _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near):
+def _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner, kind):
     """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
     step, on, least, nearest = 0, 0.0, np.inf, np.inf
     for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
-        if ties[other, 1] < 0 or other == s:
+        if endpoints[other, 1] < 0 or other == s:
             continue
-        if ties[s, 1] < 0:
-            t, off, ahead = _end_at(s, other, way, origin, ties, place, clock, corner, near)
+        if endpoints[s, 1] < 0:
+            t, off, ahead = _end_at(s, other, way, origin, endpoints, place, clock, corner, kind)
             nearer = off < least - TIE or (off < least + TIE and ahead < nearest - TIE)
-            if nearer and not _apart(first, stop, s, other, ties, clock):
+            if nearer and not _apart(first, stop, s, other, endpoints, clock):
                 step, on, least, nearest = other - s, t, off, ahead
             continue
         low, high = min(clock[other, 0], clock[other, 1]), max(clock[other, 0], clock[other, 1])
         crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)
         for e in range(2):  # Those that begin in one place do not.
             crosses &= abs(clock[s, e] - low) > TIE and abs(clock[s, e] - high) > TIE
-        if crosses and other < s and step == 0 and hub[other] == 0:
-            on = _crossing(s, other, origin, ties, place, corner)
+        if crosses and other < s and step == 0 and junction[other] == 0:
+            on = _cut_at(s, other, origin, endpoints, place, corner)
             step = other - s if on >= 0 else 0
     return step, on
 
 
 @compiled(inline="always")
-def _where_both_end(s, other, origin, ties, square_sides, place, tangent):
-    """Where the outlines of two lone breaks of a square meet, from its first centre: ahead, or midway between both."""
-    start, end = _row(place, ties[s, 0]), _row(place, ties[other, 0])
-    way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
-    back = _inward(_row(tangent, ties[other, 0]), square_sides[other, 0])
+def _where_both_end(s, other, origin, endpoints, dual_sides, place, tangent):
+    """Where the outlines of two lone crossings of a dual cell meet, from its first centre: ahead, or midway."""
+    start, end = _row(place, endpoints[s, 0]), _row(place, endpoints[other, 0])
+    way = _inward(_row(tangent, endpoints[s, 0]), dual_sides[s, 0])
+    back = _inward(_row(tangent, endpoints[other, 0]), dual_sides[other, 0])
     point, between = _meeting(start, way, end, (-back[0], -back[1]))
     if not (between and _within(point, origin, s)):
         point = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
@@ -572,61 +576,61 @@ def _where_both_end(s, other, origin, ties, square_sides, place, tangent):
 
 
 @loop
-def meet(origin, ties, square_sides, place, tangent, near, hub, corner, pull, neighbours):
-    """Fill in `hub` (S,), and what else `Outlines` has of the segments with one.
+def join_lone_ends(origin, endpoints, dual_sides, place, tangent, kind, junction, corner, pull, neighbours):
+    """Fill in `junction` (S,), and what else `Outlines` has of the segments with one.
 
-    `near` (B,) is that of `Breaks`; other arguments are as of `corners`.
+    `kind` (B,) is that of `Crossings`; other arguments are as of `corners`.
 
-    A lone break ends at a segment of its square, since what this bounds hides the rest. The outline goes on along its
-    tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone breaks
-    that have no segment beside them meet in a point. Where light passes through, outlines cross.
+    A lone crossing ends at a segment of its dual cell, since what this bounds hides the rest. The outline goes on along
+    its tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone
+    crossings that have no segment beside them meet in a point. Where light passes through, outlines cross.
     """
-    count, first = len(ties), 0
-    # Where segments end on the sides of their squares, see `on_sides`.
+    count, first = len(endpoints), 0
+    # Where segments end on the sides of their dual cells, see `on_sides`.
     clock, on = np.zeros((count, 2)), np.zeros(count)
     for s in range(count):
         for e in range(2):
-            if ties[s, e] >= 0:
-                x, y = _row(place, ties[s, e])
-                clock[s, e] = on_sides(x - origin[s, 1] - 0.5, y - origin[s, 0] - 0.5, square_sides[s, e])
+            if endpoints[s, e] >= 0:
+                x, y = _row(place, endpoints[s, e])
+                clock[s, e] = on_sides(x - origin[s, 1] - 0.5, y - origin[s, 0] - 0.5, dual_sides[s, e])
     while first < count:
         stop = first + 1
         while stop < count and origin[stop, 0] == origin[first, 0] and origin[stop, 1] == origin[first, 1]:
             stop += 1
-        for s in range(first, stop if stop > first + 1 else first):  # One alone in its square meets none.
-            way = _inward(_row(tangent, ties[s, 0]), square_sides[s, 0])
-            hub[s], on[s] = _hub(first, stop, s, way, origin, ties, place, clock, hub, corner, near)
+        for s in range(first, stop if stop > first + 1 else first):  # One alone in its dual cell meets none.
+            way = _inward(_row(tangent, endpoints[s, 0]), dual_sides[s, 0])
+            junction[s], on[s] = _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner, kind)
         lead, alone = -1, True
         for s in range(first, stop):
-            if ties[s, 1] >= 0 or hub[s] != 0:
+            if endpoints[s, 1] >= 0 or junction[s] != 0:
                 continue
             if lead < 0:
                 lead = s
-            elif s - lead <= REACH and not _apart(first, stop, s, lead, ties, clock):
+            elif s - lead <= REACH and not _apart(first, stop, s, lead, endpoints, clock):
                 if alone:
                     corner[lead, 0], corner[lead, 1] = _where_both_end(
-                        lead, s, origin, ties, square_sides, place, tangent
+                        lead, s, origin, endpoints, dual_sides, place, tangent
                     )
-                alone, hub[s] = False, lead - s
+                alone, junction[s] = False, lead - s
         first = stop
     for s in range(count):
-        if hub[s] == 0:
+        if junction[s] == 0:
             continue
-        other = s + hub[s]
-        if hub[other] != 0:  # What crosses another one is no hub: that one is.
-            hub[s], on[s] = hub[s] + hub[other], on[other]
-            other = s + hub[s]
-            if abs(hub[s]) > REACH:
-                hub[s] = 0
+        other = s + junction[s]
+        if junction[other] != 0:  # What crosses another one is no junction: that one is.
+            junction[s], on[s] = junction[s] + junction[other], on[other]
+            other = s + junction[s]
+            if abs(junction[s]) > REACH:
+                junction[s] = 0
                 continue
-        if ties[other, 1] < 0:
+        if endpoints[other, 1] < 0:
             corner[s] = corner[other]
             continue
         e = 0 if on[s] < 1 else 1
         share = on[s] if e == 0 else 2 - on[s]
-        end, middle = _on_segment(origin, other, e, ties, place, corner)
+        end, middle = _on_segment(origin, other, e, endpoints, place, corner)
         for a in range(2):
             corner[s, a] = min(max((1 - share) * end[a] + share * middle[a], 0.0), 1.0)
-            neighbours[s, 1 + a] = ties[other, a]
+            neighbours[s, 1 + a] = endpoints[other, a]
         pull[s, 0], pull[s, 3] = pull[other, 0] + pull[other, 1], pull[other, 2] + pull[other, 3]
         pull[s, 1], pull[s, 2] = 0.0, 0.0

@@ -1,12 +1,12 @@
-"""Silhouettes: edges of triangles where a sheet ends or turns away; and the gaps that they meet. Compiled."""
+"""Silhouettes: edges of triangles where a patch ends or turns away; and the gaps that they meet. Compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
-from rts.outlines.sheets_loops import on_edges, plane_at
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
+from rts.outlines.seen_mesh_loops import on_edges, plane_at
 from rts.sampling.points_loops import corners_of, edge
 
 SLACK = 0.01
@@ -29,7 +29,7 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        seen: (V, 2), see `sheets_loops.projected`.
+        seen: (V, 2), see `seen_mesh_loops.projected`.
         sides: (T,) to fill.
     """
     corners = np.empty((3, 4))
@@ -53,7 +53,9 @@ def _extent(a, b, c, seen, axis):
 
 
 @loop
-def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sides, part, depth, width, gaps):
+def mark_silhouettes(
+    first, last, rows, vertices, faces, near_plane, keep, seen, adjacent, sides, part, depth, width, gaps
+):
     """Mark, in `gaps` (2, H, W), those that silhouettes meet: 2, or 1 where both centres show something nearer.
 
     Args:
@@ -64,8 +66,8 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         faces: (T, 3) of the proxy.
         near_plane: (4,), positive on what is seen.
         keep: (T,), see `spans_loops.spans_of`.
-        seen: (V, 2), see `sheets_loops.projected`.
-        beyond: (T, 3), see `sheets_loops.neighbours`.
+        seen: (V, 2), see `seen_mesh_loops.projected`.
+        adjacent: (T, 3), see `seen_mesh_loops.neighbours`.
         sides: (T + 1,), see `turns`; the last is 0, of the triangle −1, which is none.
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
@@ -78,11 +80,13 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         if side == 0 or side * keep[t] < 0:
             continue
         # In most triangles all three neighbours go on: one branch.
-        on = (sides[beyond[t, 0]] * side > 0) & (sides[beyond[t, 1]] * side > 0) & (sides[beyond[t, 2]] * side > 0)
+        on = (
+            (sides[adjacent[t, 0]] * side > 0) & (sides[adjacent[t, 1]] * side > 0) & (sides[adjacent[t, 2]] * side > 0)
+        )
         if on:
             continue
         for c in range(3):
-            s = beyond[t, c]
+            s = adjacent[t, c]
             # Two kept triangles that fold have an edge in common, which is told once.
             if s >= 0 and (sides[s] * side > 0 or (keep[t] == 0 and s < t and sides[s] != 0)):
                 continue
@@ -153,7 +157,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
 
 @compiled(inline="always")
 def _mark(axis, ends, nearest, part, depth, width, gaps):
-    """Mark the gaps along an axis that an edge meets; see `meet`, whose depths are compared with the edge's nearest."""
+    """Mark the gaps along an axis that an edge meets; see `mark_silhouettes`; depths are compared with the nearest."""
     height, across = part.shape
     lines, count = (height, across) if axis == 0 else (across, height)
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
@@ -178,33 +182,33 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
 
 
 @loop
-def edges(first, last, near, parts, triangles, points, own, rows, vertices, faces, slope, depth, tangent):
-    """What the triangles of some parts tell of breaks.
+def edges(first, last, kind, parts, triangles, points, own, rows, vertices, faces, slope, depth, tangent):
+    """What the triangles of some parts tell of crossings.
 
     Args:
-        first: the first break.
-        last: the break after the last.
-        near: (B,), see `edge_kinds.BEFORE_ENDS`.
+        first: the first crossing.
+        last: the crossing after the last.
+        kind: (B,), see `edge_kinds.BEFORE_ENDS`.
         parts: (B, 2), the parts before and behind.
         triangles: (B, 2 or more), alike.
-        points: (B, 2), where breaks are.
+        points: (B, 2), where crossings are.
         own: the first of the parts, and the one after the last.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        slope: (B, 2, 2) to fill where surfaces cross: slopes of depth along x and y, a cell.
-        depth: (B,) to fill: of the surface that ends, or where surfaces cross.
+        slope: (B, 2, 2) to fill where surfaces intersect: slopes of depth along x and y, a cell.
+        depth: (B,) to fill: of the surface that ends, or where surfaces intersect.
         tangent: (B, 2) to fill: along the nearest edge of the triangle that ends, or of the one before.
     """
     corners = np.empty((3, 4))
     for b in range(first, last):
         x, y = points[b, 0], points[b, 1]
         for side in range(2):
-            ends = side == (1 if near[b] == BEHIND_ENDS else 0)
-            if not (own[0] <= parts[b, side] < own[1] and (ends or near[b] == CROSS)):
+            ends = side == (1 if kind[b] == BEHIND_ENDS else 0)
+            if not (own[0] <= parts[b, side] < own[1] and (ends or kind[b] == INTERSECT)):
                 continue
             sign = corners_of(triangles[b, side], rows, vertices, faces, corners)
-            if near[b] == CROSS:
+            if kind[b] == INTERSECT:
                 # Not a number where a triangle is seen edge-on.
                 depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
             else:
@@ -226,26 +230,26 @@ def _nearest_edge(corners, sign, x, y):
 
 
 @loop
-def settle(width, depth, near, slope, tangent, away):
-    """Make tangents (B, 2) unit directions, of crossings the lines where planes meet; those that are flat end before.
+def finish_directions(width, depth, kind, slope, tangent, away):
+    """Make tangents (B, 2) unit directions, of intersections where planes meet; those that are flat end before.
 
     Args:
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         depth: (B,), see `edges`.
-        near: (B,), see `edges`; becomes BEFORE_ENDS where slopes of surfaces that cross hardly differ.
-        slope: (B, 2, 2), see `edges`; becomes 0 but at crossings.
+        kind: (B,), see `edges`; becomes BEFORE_ENDS where slopes of surfaces that intersect hardly differ.
+        slope: (B, 2, 2), see `edges`; becomes 0 but at intersections.
         tangent: (B, 2), see `edges`.
-        away: (B,) to fill with `Breaks.cells_away`.
+        away: (B,) to fill with `Crossings.cells_away`.
     """
-    for b in range(len(near)):
+    for b in range(len(kind)):
         away[b] = np.log(width[0] + width[1] * depth[b]) / width[1] if width[1] > 0 else depth[b] / width[0]
-        if near[b] == CROSS:
+        if kind[b] == INTERSECT:
             x, y = slope[b, 1, 0] - slope[b, 0, 0], slope[b, 1, 1] - slope[b, 0, 1]
             if abs(x) + abs(y) > 1e-4 * (width[0] + width[1] * depth[b]):
                 tangent[b, 0], tangent[b, 1] = y, -x
             else:
-                near[b] = BEFORE_ENDS
-        if near[b] != CROSS:
+                kind[b] = BEFORE_ENDS
+        if kind[b] != INTERSECT:
             slope[b] = 0.0
         length = np.hypot(tangent[b, 0], tangent[b, 1])
         if length > 0:

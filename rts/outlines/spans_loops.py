@@ -33,9 +33,9 @@ def wanted(first, last, part, joined, met, gaps, same):
         first: the first line.
         last: the line after the last.
         part: (K, H, W) int32, the parts seen at centres.
-        joined: (2, K H, W) bool, true if a sheet joins a layer to that of the next centre; see `sheets_loops.seams`.
+        joined: (2, K H, W) bool, true if a patch joins a layer to that of the next centre; see `seen_mesh_loops.seams`.
         met: (2, H, W) uint8, 2 where a silhouette passes.
-        gaps: (2, H, W) bool to fill: something is seen at one of both centres that no sheet joins; or `met` is 2.
+        gaps: (2, H, W) bool to fill: something is seen at one of both centres that no patch joins; or `met` is 2.
         same: (2, H, W) bool to fill: the same parts are seen at both, and some.
     """
     layers, height, width = part.shape
@@ -188,7 +188,7 @@ def spans_of(
     rows,
     vertices,
     faces,
-    beyond,
+    adjacent,
     clip,
     keep,
     seen,
@@ -208,10 +208,10 @@ def spans_of(
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        beyond: (T, 3), see `sheets_loops.neighbours`.
+        adjacent: (T, 3), see `seen_mesh_loops.neighbours`.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: (T,) int8, the sign of the determinants of triangles that are kept; 0 keeps both.
-        seen: (V, 2), see `sheets_loops.projected`.
+        seen: (V, 2), see `seen_mesh_loops.projected`.
         gap: see `Gaps`.
         by_row: see `Gaps`.
         by_column: see `Gaps`.
@@ -241,7 +241,7 @@ def spans_of(
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
                 least, most, start, end = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
                 on_line = table[n, low], table[n, high], 1 - axis
-                bounds = least, most, seams * (_is_open(beyond, t, start) + 2 * _is_open(beyond, t, end) + large)
+                bounds = least, most, seams * (_is_open(adjacent, t, start) + 2 * _is_open(adjacent, t, end) + large)
                 count = _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count)
 
 
@@ -258,10 +258,10 @@ def _normal(t, sign, vertices, faces):
 
 
 @compiled(inline="always")
-def _is_open(beyond, t, edge):
+def _is_open(adjacent, t, edge):
     """True if an edge of a triangle has no other triangle beyond it; False for what is no edge, but a plane."""
     # Without branches: no processor could tell which edges bound a span.
-    return (edge >= 0) & (edge < 3) & (beyond[t, min(max(edge, 0), 2)] < 0)
+    return (edge >= 0) & (edge < 3) & (adjacent[t, min(max(edge, 0), 2)] < 0)
 
 
 @compiled(inline="always")

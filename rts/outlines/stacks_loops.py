@@ -1,6 +1,6 @@
 """The stacks of layers along gaps, from spans, and the places where they change. Compiled.
 
-A *run* is a surface along a gap: spans that follow one another, end to start. A sheet that turns away ends there, as
+A *run* is a surface along a gap: spans that follow one another, end to start. A patch that turns away ends there, as
 the back does that it turns into. The stack at a place is the runs there, front to back. It changes where a run starts
 or ends, and where two runs pass through one another.
 
@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS
-from rts.outlines.fronts_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at, is_seam
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
+from rts.outlines.first_hits_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at, is_seam
 from rts.outlines.spans_loops import TINY
 
 CLOSE = 1e-5
@@ -77,7 +77,7 @@ def _hides(opaque, z, seen, depth, y, x):
 
 
 @compiled(inline="always")
-def _settle(head, tail, own, of, opaque, seen, depth, gap, g):
+def _fit_to_centres(head, tail, own, of, opaque, seen, depth, gap, g):
     """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
 
     A run that covers a centre with no sample there touches the line with an edge alone.
@@ -145,7 +145,7 @@ def _seen(stack, at, most, of):
 
 @compiled(inline="always")
 def _partner(i, n, own, of, place, end, link):
-    """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
+    """Another run of the same part that ends (or starts) where one does: a patch turns away there; or −1.
 
     Their depths differ where triangles in between are seen from the side.
 
@@ -234,7 +234,7 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
 
     `enders[f]` are filled with the runs that change, the second one −1 for none.
     """
-    e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == CROSS else partner
+    e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == INTERSECT else partner
     enders[f, 0], enders[f, 1] = stack[at], stack[second] if second >= 0 else -1
     whole[e, 1], place_of[e] = kind, place
     samples[e], sides[e] = -1, -1
@@ -247,14 +247,14 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
         samples[e, 2 + n, 0], samples[e, 2 + n, 1] = of[i, PART], of[i, TRIANGLE]
         places[e, 2 + n] = min(max(place, own[i, 0]), own[i, 1])
         n += 1
-        ends = kind < CROSS and (m == at or m == partner)
-        if of[i, OPAQUE] == 1 and not ends and m > (at if kind == CROSS else -1):
+        ends = kind < INTERSECT and (m == at or m == partner)
+        if of[i, OPAQUE] == 1 and not ends and m > (at if kind == INTERSECT else -1):
             break
     for side in range(2):
         k, whole[e, 2 + side] = 0, -1
         for m in range(n):
             here = m
-            if kind == CROSS and side == 1 and (m == at or m == at + 1) and at + 1 < n:
+            if kind == INTERSECT and side == 1 and (m == at or m == at + 1) and at + 1 < n:
                 here = 2 * at + 1 - m
             if kind == 1 - side and (m == at or m == partner):
                 continue
@@ -264,8 +264,8 @@ def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, wh
             k += 1
             if of[stack[here], OPAQUE] == 1:
                 break
-    # The surface that changes, and what is behind it: parts before and behind the break.
-    if kind == CROSS:
+    # The surface that changes, and what is behind it: parts before and behind the crossing.
+    if kind == INTERSECT:
         whole[e, 2], whole[e, 3] = of[stack[at], PART], of[stack[at + 1], PART]
     else:
         whole[e, 2 + kind] = of[stack[at], PART]
@@ -281,7 +281,7 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
     place = place_of[e]
     for n in range(2):
         i = enders[f, n]
-        if kind == CROSS:
+        if kind == INTERSECT:
             samples[e, n, 0], samples[e, n, 1], places[e, n] = of[i, PART], of[i, TRIANGLE], place
             continue
         if i < 0:
@@ -319,7 +319,7 @@ def _fill_runs(g, n, own, of, opaque, seen, depth, gap, knots):
         tail, j = i, i
         while of[tail, AFTER] >= 0:
             tail = of[tail, AFTER]
-        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _settle(i, tail, own, of, opaque, seen, depth, gap, g)
+        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _fit_to_centres(i, tail, own, of, opaque, seen, depth, gap, g)
         while j >= 0:
             of[j, LIVE] = real
             j = of[j, AFTER]
@@ -363,7 +363,7 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             place = max(place, there)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, CROSS, m, -1, place
+                    change = base, found, INTERSECT, m, -1, place
                     _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             stack[m], stack[m + 1] = stack[m + 1], stack[m]
@@ -429,8 +429,8 @@ def changes(
         rows: (M,) int64 to fill: the row where the changes of each gap begin; −1 where there is too little room.
         counts: (M,) int32 to fill: the number of changes of each gap.
         inner: distance of the samples that tell colours of what ends.
-        whole: (E, 6) int32 to fill: gap; BEFORE_ENDS, BEHIND_ENDS or CROSS; the part of the surface that changes,
-            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
+        whole: (E, 6) int32 to fill: gap; BEFORE_ENDS, BEHIND_ENDS or INTERSECT; the part of the surface that changes,
+            and the part behind it, or those that intersect, as before and behind; 1 for the gap's first, and its last.
         place_of: (E,) float64 to fill: their places.
         samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
             of the stack there, front to back, with what starts or ends.

@@ -8,8 +8,8 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel, read_only
-from rts.outlines.areas_loops import add_squares
-from rts.outlines.edge_kinds import CROSS
+from rts.outlines.areas_loops import add_dual_cells
+from rts.outlines.edge_kinds import INTERSECT
 
 BANDS, SEGMENTS = 8, 400
 """The most bands of lines whose entries are made at once, and the fewest segments of each. These are numbers of their
@@ -17,19 +17,19 @@ own, so that results are the same for any number of threads."""
 
 
 @loop
-def _normals(gap, place, ties):
-    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+def _normals(gap, place, endpoints):
+    """Unit normals (B, 2) of outlines at crossings: the mean of their segments'; along the gap for a lone crossing."""
     normal = np.empty((len(gap), 2))
     for b in range(len(gap)):
         normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
-    for s in range(len(ties)):
-        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
+    for s in range(len(endpoints)):
+        if endpoints[s, 1] < 0 or endpoints[s, 0] == endpoints[s, 1]:
             continue
-        start, end = ties[s, 0], ties[s, 1]
+        start, end = endpoints[s, 0], endpoints[s, 1]
         nx = gap[end, 0] - gap[start, 0] + place[end] * (1 - gap[end, 2]) - place[start] * (1 - gap[start, 2])
         ny = gap[start, 1] - gap[end, 1] + place[start] * gap[start, 2] - place[end] * gap[end, 2]
         for b in (start, end):
-            # Two segments at a line of crossing may run in opposite directions.
+            # Two segments at a line of intersection may run in opposite directions.
             sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
             normal[b, 0] += sign * nx
             normal[b, 1] += sign * ny
@@ -42,7 +42,7 @@ def _normals(gap, place, ties):
 
 @compiled
 def _former(gap, b, i, joined):
-    """The cell (y, x) before the one on a side of a break, or the latter if it shows another surface; True if not."""
+    """The cell (y, x) before the one on a side of a crossing, or this if that shows another surface; True if not."""
     right, down = gap[b, 2], 1 - gap[b, 2]
     y, x = gap[b, 0] + i * down, gap[b, 1] + i * right
     by, bx = y + (2 * i - 1) * down, x + (2 * i - 1) * right
@@ -53,39 +53,43 @@ def _former(gap, b, i, joined):
 
 @compiled
 def _add_sides(
-    begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, parts, motions,
-    rates, n, m,
+    begin, end, place, gap, ends, rows, stack, joined, row, at_centres, shown, normal, first_stack, colors, parts,
+    motions, rates, n, m,
 ):  # fmt: skip
-    """Add the entries of the surfaces on both sides of breaks with cells in lines `begin` to `end`; see `entries`.
+    """Add the entries of the surfaces on both sides of crossings with cells in lines `begin` to `end`; see `entries`.
 
-    From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
+    From the centre to the crossing, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
     the outline's normal, with the mean motion of both samples. What is left of a cell that the outline cuts has a mean
     colour other than C: the slope from the centre before tells it. The strip in the next cell differs from X by half
     the slope times its width.
 
-    Of layers each moves by itself: what ends at the break along the normal, others along the gap.
+    Of layers each moves by itself: what ends at the crossing along the normal, others along the gap.
 
     Returns:
         The numbers of entries of colours, and of motions.
     """
-    width = fronts.shape[1]
+    width = at_centres.shape[1]
     for b in range(len(gap)):
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
         if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
             continue
-        ahead, step, further = nx * right + ny * (1 - right), right + (1 - right) * width, fronts.size + first_stack[b]
+        ahead, step, further = (
+            nx * right + ny * (1 - right),
+            right + (1 - right) * width,
+            at_centres.size + first_stack[b],
+        )
         for i in range(2):
             last, way = shown[b, i], 1 - 2 * i
             y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
-            cell, here = y * width + x, fronts[y, x]
+            cell, here = y * width + x, at_centres[y, x]
             if not (ends[b, i] and last >= 0 and here >= 0):
                 continue
             next_ = cell + way * step
             length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
             inside, outside = min(length, 0.5), max(length - 0.5, 0.0)
             by, bx, on = _former(gap, b, i, joined)
-            former, rate = fronts[by, bx], 1 / (1 + length) if on else 1 / max(length, 0.5)
+            former, rate = at_centres[by, bx], 1 / (1 + length) if on else 1 / max(length, 0.5)
             nearer = ahead * ahead * (0.125 - inside**2 / 2) if on else 0.0
             farther = ahead * ahead * rate * outside**2 / 2
             for at, color, share in ((cell, here, nearer), (next_, last, farther)):
@@ -100,7 +104,7 @@ def _add_sides(
                     m = _add_motion(motions, rates, m, at, rows[b, i], share, across, last, here)
                     m = _add_motion(motions, rates, m, at, row[0, y, x], share, across, last, here)
                 continue
-            # The composite of a cell changes as that of a stack where one layer is that of the break.
+            # The composite of a cell changes as that of a stack where one layer is that of the crossing.
             along = -0.5 * way * right, -0.5 * way * (1 - right)
             for k in range(len(row)):
                 own, there, stays = row[k, y, x], stack[b, i, k], False
@@ -155,7 +159,7 @@ def _at(colors, several, color):
 
 
 @compiled
-def _sorted_colors(colors, parts, count, start, cells, fronts):
+def _sorted_colors(colors, parts, count, start, cells, at_centres):
     """Entries of colours by cell, one for each colour of a cell, without those of 0.
 
     In each cell weights are at least 0, and their sum at most 1, with the 1 by which the centre's colour counts:
@@ -163,7 +167,7 @@ def _sorted_colors(colors, parts, count, start, cells, fronts):
     """
     first, order = _by_cells(colors, count, start, cells)
     cell_of, color_of, weight_of = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count)
-    color, weight, front, n = np.empty(count + 1, np.int32), np.empty(count + 1), fronts.reshape(-1), 0
+    color, weight, front, n = np.empty(count + 1, np.int32), np.empty(count + 1), at_centres.reshape(-1), 0
     for i in range(cells):
         if first[i] == first[i + 1]:
             continue
@@ -197,15 +201,15 @@ def _sort_motions(n, motions, rates, order, cell, sample, weight, colors):
 
 
 @loop
-def _of_breaks(near, slope, rows, inner, pair, stack, cells):
-    """Which samples tell the colours beside breaks, and which their motions; arguments as of `entries`.
+def _of_crossings(kind, slope, rows, inner, pair, stack, cells):
+    """Which samples tell the colours beside crossings, and which their motions; arguments as of `entries`.
 
     Returns:
-        The colours (B, 2) before and behind breaks, or −1, of several layers those of composites after the ones of so
-        many `cells`; the samples (B, 2) that breaks move with, or −1: the last ones, or a pair; and the motion
-        (B, 2, 3, 2) of breaks along x and y, for motions (x, y, depth) of these two samples.
+        The colours (B, 2) before and behind crossings, or −1, of several layers those of composites after the ones of
+        so many `cells`; the samples (B, 2) that crossings move with, or −1: the last ones, or a pair; and the motion
+        (B, 2, 3, 2) of crossings along x and y, for motions (x, y, depth) of these two samples.
     """
-    count = len(near)
+    count = len(kind)
     shown, movers, moves = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), np.zeros((count, 2, 3, 2))
     for b in range(count):
         paired = pair[b, 0] >= 0
@@ -218,8 +222,8 @@ def _of_breaks(near, slope, rows, inner, pair, stack, cells):
             for i in range(2):
                 moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
             continue
-        if near[b] < CROSS:
-            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
+        if kind[b] < INTERSECT:
+            moves[b, kind[b], 0, 0], moves[b, kind[b], 1, 1] = 1.0, 1.0
             continue
         square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
         for a in range(2):
@@ -234,9 +238,9 @@ def _of_breaks(near, slope, rows, inner, pair, stack, cells):
 
 @loop
 def _further_stacks(gap, ends, stack, row, shown):
-    """Stacks (R, K): two of each break, then those of cells in which one layer is a break's; arguments as of `entries`.
+    """Stacks (R, K): two of each crossing, then those of cells in which one layer is a crossing's; see `entries`.
 
-    Also returns the number (B,) of each break's first of the latter.
+    Also returns the number (B,) of each crossing's first of the latter.
     """
     layers, count, r = len(row), len(gap), 2 * len(gap)
     stacks, first = np.empty((r * (1 + layers), layers), np.int32), np.empty(count, np.int32)
@@ -256,53 +260,53 @@ def _further_stacks(gap, ends, stack, row, shown):
 
 @loop
 def _in_lines(
-    begin, end, place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row,
-    fronts, shown, movers, moves, normal, first_stack,
+    begin, end, place, gap, ends, rows, stack, dual, endpoints, dual_sides, junction, adjacent, corner, pull, joined,
+    row, at_centres, shown, movers, moves, normal, first_stack,
 ):  # fmt: skip
     """The entries in the cells of lines `begin` to `end`: colours as of `entries`, and motions, with their order."""
-    segments, breaks, width = 0, 0, row.shape[2]
-    for s in range(len(square)):
-        segments += begin - 1 <= square[s, 0] < end
+    segments, crossings, width = 0, 0, row.shape[2]
+    for s in range(len(dual)):
+        segments += begin - 1 <= dual[s, 0] < end
     for b in range(len(place)):
-        breaks += begin - 1 <= gap[b, 0] < end
-    most = 20 * segments + 4 * breaks
+        crossings += begin - 1 <= gap[b, 0] < end
+    most = 20 * segments + 4 * crossings
     colors, parts = np.empty((most, 3), np.int32), np.empty(most)
-    most = 64 * segments + 8 * breaks * len(row) + 1  # The last may be one of 0.
+    most = 64 * segments + 8 * crossings * len(row) + 1  # The last may be one of 0.
     motions, rates = np.empty((most, 4), np.int32), np.empty((most, 3))
-    n, m = add_squares(
-        begin, end, place, gap, square, ties, square_sides, hub, beyond, corner, pull, fronts, shown, movers, moves,
-        colors, parts, motions, rates,
+    n, m = add_dual_cells(
+        begin, end, place, gap, dual, endpoints, dual_sides, junction, adjacent, corner, pull, at_centres, shown,
+        movers, moves, colors, parts, motions, rates,
     )  # fmt: skip
     n, m = _add_sides(
-        begin, end, place, gap, ends, rows, stack, joined, row, fronts, shown, normal, first_stack, colors, parts,
+        begin, end, place, gap, ends, rows, stack, joined, row, at_centres, shown, normal, first_stack, colors, parts,
         motions, rates, n, m,
     )  # fmt: skip
     start, cells = begin * width, (end - begin) * width
     order = _by_cells(motions, m, start, cells)[1]
-    return *_sorted_colors(colors, parts, n, start, cells, fronts), motions, rates, order
+    return *_sorted_colors(colors, parts, n, start, cells, at_centres), motions, rates, order
 
 
 def entries(
-    place, gap, near, slope, ends, rows, inner, pair, stack, square, ties, square_sides, hub, beyond, corner, pull,
-    joined, row, real,
+    place, gap, kind, slope, ends, rows, inner, pair, stack, dual, endpoints, dual_sides, junction, adjacent, corner,
+    pull, joined, row, real,
 ) -> Any:  # fmt: skip
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
     Args:
         place: (B,) of outlines, as all up to `joined`.
         gap: (B, 3).
-        near: (B,).
+        kind: (B,).
         slope: (B, 2, 2).
         ends: (B, 2).
         rows: (B, 2).
         inner: (B, 2).
         pair: (B, 2).
         stack: (B, 2, K); K = 0 for one layer.
-        square: (S, 2).
-        ties: (S, 2).
-        square_sides: (S, 2).
-        hub: (S,).
-        beyond: (S, 2).
+        dual: (S, 2).
+        endpoints: (S, 2).
+        dual_sides: (S, 2).
+        junction: (S,).
+        adjacent: (S, 2).
         corner: (S, 2).
         pull: (S, 4).
         joined: (2, H, W).
@@ -312,22 +316,22 @@ def entries(
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
     """
-    fronts, cells, stacks, first_stack = row[0], row[0].size, np.empty((0, 0), np.int32), np.zeros_like(near)
-    shown, movers, moves = _of_breaks(near, slope, rows, inner, pair, stack, cells)
+    at_centres, cells, stacks, first_stack = row[0], row[0].size, np.empty((0, 0), np.int32), np.zeros_like(kind)
+    shown, movers, moves = _of_crossings(kind, slope, rows, inner, pair, stack, cells)
     if stack.shape[2]:
-        fronts = np.where(fronts >= 0, np.arange(cells, dtype=np.int32).reshape(fronts.shape), np.int32(-1))
+        at_centres = np.where(at_centres >= 0, np.arange(cells, dtype=np.int32).reshape(at_centres.shape), np.int32(-1))
         stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
-    of_breaks = read_only(fronts), shown, movers, moves, _normals(gap, place, ties), first_stack
-    bands = min(BANDS, 1 + len(square) // SEGMENTS)
-    lines = [0, *square[len(square) * np.arange(1, bands) // bands, 0].tolist(), row.shape[1]]
-    known = place, gap, ends, rows, stack, square, ties, square_sides, hub, beyond, corner, pull, joined, row
+    of_crossings = read_only(at_centres), shown, movers, moves, _normals(gap, place, endpoints), first_stack
+    bands = min(BANDS, 1 + len(dual) // SEGMENTS)
+    lines = [0, *dual[len(dual) * np.arange(1, bands) // bands, 0].tolist(), row.shape[1]]
+    known = place, gap, ends, rows, stack, dual, endpoints, dual_sides, junction, adjacent, corner, pull, joined, row
     found: list[Any] = [()] * bands
 
     def some(first, last):
         for i in range(first, last):
-            found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_breaks)
+            found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_crossings)
 
-    parallel(some, bands, work=1500 * len(square))
+    parallel(some, bands, work=1500 * len(dual))
     *colors, _, _, orders = zip(*found, strict=True)
     at = np.cumsum([0, *map(len, orders)]).tolist()
     motions = *np.empty((2, at[-1]), np.int32), np.empty((at[-1], 3), real), np.empty((at[-1], 2), np.int32)

@@ -18,9 +18,9 @@ def program(f: Callable[..., Tree], **options: Any) -> Callable[..., Tree]:
     """A function like `f` that runs as one program, which the engine of its arguments compiles at the first call.
 
     For a GPU, where torch otherwise launches hundreds of small operators one by one. Call `rts.sample` before, and pass
-    what it gives: numbers of samples and of edge crossings may change from call to call. So may values of arguments, which have
-    their derivatives. For other shapes, dtypes or settings a further program is compiled; by torch also where there is
-    no sample or crossing, or one. Arrays that `f` closes over are those of the first call.
+    what it gives: numbers of samples and of edge crossings may change from call to call. So may values of arguments,
+    which have their derivatives. For other shapes, dtypes or settings a further program is compiled; by torch also
+    where there is no sample or crossing, or one. Arrays that `f` closes over are those of the first call.
 
     torch compiles for a minute or two, jax for seconds. By NumPy `f` runs as it is.
 

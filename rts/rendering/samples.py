@@ -77,15 +77,15 @@ def sampled_scene(
     height, width = grid.size[0] - 2 * apron, grid.size[1] - 2 * apron
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     given, (scene, grid) = scene, on_the_host(scene, grid)
-    told = settings.told([given] if one_shader else None)
+    required = settings.required([given] if one_shader else None)
     # Inside of one colour nothing depends on where a sample lies.
-    same, layers = not told.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
+    same, layers = not required.colors and outlines and settings.layers == 1 and not settings.fronts, settings.layers
     request = Request(capacity, triangles=outlines or settings.fronts)
     sampled = None
     if outlines and layers != "auto" and not settings.fronts and not scene.cameras:
         from rts.outlines.of_traced import sampled_by_one_call
 
-        sampled = sampled_by_one_call(scene, grid, layers, told, same, capacity)
+        sampled = sampled_by_one_call(scene, grid, layers, required, same, capacity)
     if sampled is not None:
         return replace(sampled, supersample=factor, apron=apron)
     at_once, none = None, [False] * len(scene.parts)
@@ -104,11 +104,11 @@ def sampled_scene(
     while True:
         sampled = with_all_layers(taken, all(scene.opaque), least) if layers == "auto" else taken(layers)
         if at_once is not None:
-            sampled = at_once.found(sampled, told if outlines else None, real_of(scene), same)
+            sampled = at_once.found(sampled, required if outlines else None, real_of(scene), same)
         elif outlines:
             from rts.outlines.of_scene import with_outlines
 
-            triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, told, capacity)
+            triangle, sampled = sampled.triangle, with_outlines(sampled, scene, grid, required, capacity)
             sampled = sampled.replace(triangle=triangle) if settings.fronts else sampled
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):
             break

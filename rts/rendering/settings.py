@@ -11,7 +11,7 @@ from typing import Any, Literal
 from rts.compiling.threads import thread_count
 from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
-from rts.outlines.found import Told
+from rts.outlines.found import Required
 from rts.plugin_base import promised
 from rts.sampling.layer_count import TRACED_LAYERS
 from rts.sampling.scene import Grid, Scene
@@ -86,10 +86,10 @@ class RenderSettings:
         """True if the splatter reads the outlines between centres."""
         return self.splatter is not None and "outlines" in self.splatter.reads
 
-    def told(self, scenes: Sequence[Scene] | None) -> Told:
+    def required(self, scenes: Sequence[Scene] | None) -> Required:
         """The tasks of samples beside outlines in views of a scene; with None, for any shaders and derivatives."""
         centers = self.splatter is not None and "colors at centers" in self.splatter.reads
-        return Told(centers=centers) if scenes is None else Told.of(scenes, centers)
+        return Required(centers=centers) if scenes is None else Required.of(scenes, centers)
 
     @property
     def most_layers(self) -> int:

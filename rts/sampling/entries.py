@@ -10,7 +10,7 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import is_subclass
 from rts.sampling.cache import Entry
-from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.scene import Grid, Scene, lies_on_triangles
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -28,7 +28,7 @@ def is_still(scene: Scene) -> bool:
     either. False for an engine without derivatives, by which `render` and `render_samples` of `sample` are equal to the
     bit.
     """
-    if not scene.context.engine.differentiates or not all(map(has_sheets, scene.parts, scene.samplers)):
+    if not scene.context.engine.differentiates or not all(map(lies_on_triangles, scene.parts, scene.samplers)):
         return False
     return is_constant((scene.camera, scene.read, [part.transform for part in scene.parts]))
 

@@ -55,7 +55,7 @@ def with_all_layers(taken: Callable[[int], Sampled], opaque: bool, least: int = 
 
 
 def has_full_stacks(sampled: Sampled, opaque: Sequence[bool]) -> bool:
-    """True if light passes through the last layer beside some edge crossing, so that there may be more layers than are kept.
+    """True if light passes through the last layer beside some edge crossing: more may matter than are kept.
 
     Beside the outline of something opaque there may be more than at any centre of a cell.
 

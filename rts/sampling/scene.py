@@ -101,7 +101,7 @@ class Scene(NamedTuple):
         return context if context.engine.differentiates else self.context
 
 
-def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:
+def lies_on_triangles(part: CheckedPart, sampler: Sampler) -> bool:
     """True if all samples of a part lie on triangles, which tell where its outlines are."""
     surface: Any = part.surface
     if not (is_subclass(type(sampler), TriangleSampler) and is_subclass(type(surface), TriangleSurface)):

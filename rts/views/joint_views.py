@@ -23,10 +23,14 @@ def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: Rend
     scene, grid, joint = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
-    outlines, layers, told = settings.finds_outlines, settings.most_layers, settings.told([x.scene for x in views])
-    same = not told.colors and outlines and layers == 1 and not settings.fronts
+    outlines, layers, required = (
+        settings.finds_outlines,
+        settings.most_layers,
+        settings.required([x.scene for x in views]),
+    )
+    same = not required.colors and outlines and layers == 1 and not settings.fronts
     at_once = AtOnce(joint, grid, scene.opaque if outlines else [False] * len(scene.parts))
-    sampled = at_once.found(at_once.centres(layers), told if outlines else None, real_of(scene), same)
+    sampled = at_once.found(at_once.centres(layers), required if outlines else None, real_of(scene), same)
     sampled, counts = _by_place(with_attributes(sampled, scene), [len(view.proxies) for view in views])
     sampled = replace(in_engine(sampled, scene), supersample=settings.supersample, apron=settings.apron)
     return with_counts(sampled, picture, counts)

@@ -68,7 +68,7 @@ def test_where_each_surface_has_one_colour_nothing_changes():
         assert (found[0][0][..., 3] > 0).sum() > 200
 
 
-def test_what_nothing_moves_is_shaded_at_centres_and_between_two_breaks_alone():
+def test_what_nothing_moves_is_shaded_at_centres_and_between_two_crossings_alone():
     def rows(splatter, move):
         shader = Counted()
         parts = scene(False, move, shader)

@@ -1,4 +1,4 @@
-"""Found edges of fields by rays: kinks, fields without slope at their surface, and fronts that are smooth."""
+"""Found edges of fields by rays: kinks, fields without slope at their surface, and first hits that are smooth."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def test_a_smooth_front_has_no_breaks_beside_its_outline():
     assert ((outlines.rows[:, :2] >= 0).sum(axis=1) == 1).all()
 
 
-def test_pairs_lie_on_the_rays_of_breaks():
+def test_pairs_lie_on_the_rays_of_crossings():
     part = rts.Part(rts.Sdf(diamond, 1.6), {"radius": np.float32(0.7)}, "silhouette")
     sampled, outlines = sampled_with_outlines(part, CAMERA, (SIZE, SIZE), splatter="edges")
     points, pair = sampled.samples[0].params[:, :3].astype(float), outlines.rows[:, 4:]

@@ -131,8 +131,8 @@ def test_balls_of_glass_are_as_good_as_those_of_triangles(name):
 
 
 @pytest.mark.parametrize("size", [32, 36])
-def test_two_lines_of_crossing_that_are_close_are_told_apart(size):
-    """Where fronts cross, and where backs do, in a plane that is seen nearly from its edge."""
+def test_two_lines_of_intersection_that_are_close_are_told_apart(size):
+    """Where first hits cross, and where backs do, in a plane that is seen nearly from its edge."""
     ball, other = {"center": (-0.2, 0.02, 0), "radius": 0.5}, {"center": (0.2, 0.1, 0), "radius": 0.5}
 
     def derivative(kind):

@@ -196,7 +196,7 @@ def test_rays_through_the_middle_of_a_wall_have_no_pair():
 
 
 def paired(name, way):
-    """Outlines of a shape, and for each break that has a pair the positions (B, 2, 3) of both, in pixels."""
+    """Outlines of a shape, and for each crossing that has a pair the positions (B, 2, 3) of both, in pixels."""
     f, q, eye, _ = SHAPES[name]
     surface, options = WAYS[way](lambda theta, p: f(theta["q"], p))
     part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")

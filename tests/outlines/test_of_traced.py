@@ -191,7 +191,7 @@ def test_parts_that_nothing_is_seen_of_have_no_row_in_use(shader):
         assert (here < len(used)).all()
 
 
-def test_samples_and_breaks_without_room_are_counted(monkeypatch):
+def test_samples_and_crossings_without_room_are_counted(monkeypatch):
     jax = pytest.importorskip("jax")
     poses, parts = crowd("lambert")
     poses = jax.numpy.asarray(poses)
@@ -202,19 +202,17 @@ def test_samples_and_breaks_without_room_are_counted(monkeypatch):
         few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE, capacity=50))(poses))
     assert int(few.overflow) == np.maximum(cells - 50, 0).sum() > 0
     assert np.isfinite(np.asarray(rts.render_samples(few, parts(poses), CAMERA))).all()
-    breaks = len(outlines.place)
-    monkeypatch.setattr(of_traced, "most_breaks", lambda grid, capacity: 30)
-    told = (
-        f"{breaks - 30} breaks of outlines find no room beside 30, .* give the compiled program capacity={4 * breaks}"
-    )
-    with pytest.warns(rts.errors.InputWarning, match=told):
+    crossings = len(outlines.place)
+    monkeypatch.setattr(of_traced, "most_crossings", lambda grid, capacity: 30)
+    message = f"{crossings - 30} crossings of outlines find no room beside 30, .* program capacity={4 * crossings}"
+    with pytest.warns(rts.errors.InputWarning, match=message):
         few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE))(poses))
-    assert int(few.overflow) == breaks - 30
-    with pytest.warns(rts.errors.InputWarning, match=told):
+    assert int(few.overflow) == crossings - 30
+    with pytest.warns(rts.errors.InputWarning, match=message):
         several = jax.jit(jax.vmap(lambda p: rts.sample(parts(p), CAMERA, SIZE).overflow))(
             jax.numpy.stack([poses, poses])
         ).block_until_ready()
-    assert several.tolist() == [breaks - 30] * 2
+    assert several.tolist() == [crossings - 30] * 2
 
 
 def test_prepared_parts_are_sampled_in_one_call(items):

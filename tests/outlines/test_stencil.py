@@ -1,4 +1,4 @@
-"""Stencils are the areas and fluxes of the rule, pixel by pixel; and weights of colours are convex."""
+"""Stencils are the areas and boundary terms of the rule, pixel by pixel; and weights of colours are convex."""
 
 import warnings
 
@@ -46,11 +46,11 @@ def test_bands_of_lines_have_the_entries_of_the_whole(number, monkeypatch):
         np.testing.assert_array_equal(found, expected)
 
 
-def weights_of(stencil, front):
+def weights_of(stencil, at_centres):
     """The weights (H · W, M) of colours."""
-    count = max(int(stencil.color_sample.max(initial=0)), int(front.max(initial=0))) + 1
-    weights = np.zeros((front.size, count))
-    weights[np.flatnonzero(front.reshape(-1) >= 0), front[front >= 0]] = 1
+    count = max(int(stencil.color_sample.max(initial=0)), int(at_centres.max(initial=0))) + 1
+    weights = np.zeros((at_centres.size, count))
+    weights[np.flatnonzero(at_centres.reshape(-1) >= 0), at_centres[at_centres >= 0]] = 1
     np.add.at(weights, (stencil.color_cell, stencil.color_sample), stencil.color_weight)
     return weights
 
@@ -59,46 +59,48 @@ def weights_of(stencil, front):
 def test_areas_are_those_of_polygons(number):
     """Part by part: what a region takes of samples farther inside is of the same part."""
     whole, outlines, row = mixed(number)
-    stencil, front = whole.stencil, row[0]
+    stencil, at_centres = whole.stencil, row[0]
     owners = np.repeat(np.arange(len(whole.samples)), [len(one.ids) for one in whole.samples])
-    weights = weights_of(stencil, front)
+    weights = weights_of(stencil, at_centres)
     parts = np.stack([weights[:, owners[: weights.shape[1]] == part].sum(1) for part in range(len(whole.samples))], 1)
     rows, inner = outlines.rows[:, :2], outlines.rows[:, 2:4]
     shown = np.where((rows >= 0) & (inner >= 0), inner, rows)
     cells = np.unique(stencil.color_cell)
     assert len(cells) > 5 or len(outlines.place) < 5
     for cell in cells:
-        place = divmod(int(cell), front.shape[1])
+        place = divmod(int(cell), at_centres.shape[1])
         expected = np.zeros(len(whole.samples))
-        for sample, weight in reference.areas(outlines, shown, front, place).items():
+        for sample, weight in reference.areas(outlines, shown, at_centres, place).items():
             if sample >= 0:
                 expected[owners[sample]] += weight
         np.testing.assert_allclose(parts[cell], expected, atol=2e-6, err_msg=str(place))
 
 
 @pytest.mark.parametrize("number", quick(OPAQUE))
-def test_fluxes_are_those_of_rays(number):
+def test_boundary_terms_are_those_of_rays(number):
     """Flat parts change by jumps at outlines alone."""
     whole, outlines, row = mixed(number)
-    stencil, front, rng = whole.stencil, row[0], np.random.default_rng(number)
+    stencil, at_centres, rng = whole.stencil, row[0], np.random.default_rng(number)
     owners = np.repeat(np.arange(len(whole.samples)), [len(one.ids) for one in whole.samples])
     colors, moves = rng.random(len(whole.samples)), rng.normal(size=(len(owners), 2))
     of = np.append(colors[owners], 0.0)
     jump = of[stencil.motion_colors[:, 0]] - of[stencil.motion_colors[:, 1]]
-    found = np.zeros(front.size)
+    found = np.zeros(at_centres.size)
     rates = (stencil.motion_weight[:, :2] * moves[stencil.motion_sample]).sum(1)
     np.add.at(found, stencil.motion_cell, rates * jump)
-    # A break moves as the sample of the surface that ends there.
-    rows, near = outlines.rows, outlines.near
-    crossing = near == 2
-    ending = rows[np.arange(len(near)), np.minimum(near, 1)]
+    # A crossing moves as the sample of the surface that ends there.
+    rows, kind = outlines.rows, outlines.kind
+    crossing = kind == 2
+    ending = rows[np.arange(len(kind)), np.minimum(kind, 1)]
     checked = 0
     for cell in np.unique(stencil.motion_cell):
         expected, known = 0.0, True
-        for (tie, mover), flux in reference.fluxes(outlines, divmod(int(cell), front.shape[1]), BORDER).items():
+        for (endpoint, mover), terms in reference.boundary_terms(
+            outlines, divmod(int(cell), at_centres.shape[1]), BORDER
+        ).items():
             known &= not crossing[mover] and ending[mover] >= 0
-            before, behind = of[rows[tie, 0]], of[rows[tie, 1]]
-            expected += float(flux @ moves[ending[mover]]) * (before - behind)
+            before, behind = of[rows[endpoint, 0]], of[rows[endpoint, 1]]
+            expected += float(terms @ moves[ending[mover]]) * (before - behind)
         if known:
             np.testing.assert_allclose(found[cell], expected, atol=1e-5, err_msg=str(cell))
             checked += 1
@@ -116,17 +118,17 @@ def test_weights_are_convex_and_images_in_the_range_of_colours(kind, first):
             soup = soup_of(number)
             part = rts.Part(rts.Mesh(soup.faces), {"vertices": soup.vertices}, "silhouette", cull=soup.cull)
             whole, _, row = sampled(part, soup.camera, soup.size)
-        stencil, front = whole.stencil, row[0]
+        stencil, at_centres = whole.stencil, row[0]
         count = sum(len(one.ids) for one in whole.samples)
         rng = np.random.default_rng(number)
         rgba = rng.random((count, 4)).astype(stencil.color_weight.dtype)
         rgba[:, :3] *= rgba[:, 3:]
         positions = np.zeros((count, 3), rgba.dtype)
         if stencil.stacks is not None:
-            rgba, front, _ = composites(positions, rgba, row, stencil)
-        weights = weights_of(stencil, np.asarray(front))
+            rgba, at_centres, _ = composites(positions, rgba, row, stencil)
+        weights = weights_of(stencil, np.asarray(at_centres))
         assert weights.min(initial=0) >= -1e-6 and weights.sum(1).max(initial=0) <= 1 + 1e-6, number
-        image = splat(positions, rgba, np.asarray(front), stencil, 0)
+        image = splat(positions, rgba, np.asarray(at_centres), stencil, 0)
         assert image.min(initial=0) > -1e-6 and (image <= rgba.max(0, initial=0) + 1e-6).all(), number
 
 
@@ -135,8 +137,8 @@ def test_a_pixel_that_an_edge_halves_has_half_of_each_side():
     vertices = np.array([(-9, -9, 0), (0, -9, 0), (0, 9, 0), (-9, 9, 0)], np.float32)
     part = rts.Part(rts.Mesh([(0, 1, 2), (0, 2, 3)]), {"vertices": vertices}, "silhouette")
     camera = rts.Camera.orthographic((0, 0, 3), (0, 0, 0), height=9.0)
-    stencil, front = (whole := rts.sample(part, camera, (9, 9))).stencil, whole.row[0]
-    weights = weights_of(stencil, front).sum(1).reshape(front.shape)[whole.apron :][:9, whole.apron :][:, :9]
+    stencil, at_centres = (whole := rts.sample(part, camera, (9, 9))).stencil, whole.row[0]
+    weights = weights_of(stencil, at_centres).sum(1).reshape(at_centres.shape)[whole.apron :][:9, whole.apron :][:, :9]
     np.testing.assert_allclose(weights, np.repeat([[1, 1, 1, 1, 0.5, 0, 0, 0, 0]], 9, 0), atol=1e-6)
 
 

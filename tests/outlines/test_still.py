@@ -6,7 +6,7 @@ from found_outlines import sampled_with_outlines
 from helpers import icosphere
 
 import rts
-from rts.outlines.found import Told
+from rts.outlines.found import Required
 from rts.sampling.scene import Scene
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
@@ -85,8 +85,8 @@ def test_half_of_the_samples_beside_outlines_are_left():
     part = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES}, "normals")
     near = part.replace(theta={"vertices": (VERTICES * 0.6 + [0.3, 0.2, 0.9]).astype(np.float32)})
     sampled, outlines = sampled_with_outlines([part, near], CAMERA, SIZE)
-    told = sampled.row, outlines.rows[:, :2], outlines.rows[:, 2:4]
-    seen = [np.count_nonzero(np.asarray(x) >= 0) for x in told]
+    required = sampled.row, outlines.rows[:, :2], outlines.rows[:, 2:4]
+    seen = [np.count_nonzero(np.asarray(x) >= 0) for x in required]
     assert rows(torch.as_tensor) == sum(seen)
     assert rows(np.asarray) == seen[0] + seen[2]
 
@@ -119,8 +119,10 @@ BOUNDS = (-1.5,) * 3, (1.5,) * 3
 )
 def test_other_scenes_have_motions_told(surface, theta):
     still = rts.Part(rts.Mesh(FACES), {"vertices": VERTICES, "color": torch.ones(3)}, "lambert")
-    assert Told.of([Scene.of([still], CAMERA, "auto", None)], False) == Told(motions=False)
-    assert Told.of([Scene.of([still, rts.Part(surface, theta, "lambert")], CAMERA, "auto", None)], False) == Told()
+    assert Required.of([Scene.of([still], CAMERA, "auto", None)], False) == Required(motions=False)
+    assert (
+        Required.of([Scene.of([still, rts.Part(surface, theta, "lambert")], CAMERA, "auto", None)], False) == Required()
+    )
 
 
 def test_a_program_whose_tint_is_traced_tells_colours_alone():

@@ -5,8 +5,8 @@ import pytest
 from helpers import pushed
 
 import rts
-from rts.outlines.gaps import Fronts
-from rts.outlines.halving import Hints, Oracle, find_breaks
+from rts.outlines.gaps import Hits
+from rts.outlines.halving import Hints, Oracle, find_crossings
 
 torch = pytest.importorskip("torch")
 
@@ -58,12 +58,12 @@ def test_nothing_ends_at_hints_where_nothing_changes(place, part):
     """Hints of neighbouring triangles are close to one another, as intervals are in which something ends."""
 
     def seen(*shape):
-        return Fronts(np.full(shape, part, np.int32), np.full(shape, -1, np.int32), np.full(shape, 2.0 * (part >= 0)))
+        return Hits(np.full(shape, part, np.int32), np.full(shape, -1, np.int32), np.full(shape, 2.0 * (part >= 0)))
 
     hints = Hints(np.array([[1, 1, 1]] * len(place), np.int32), np.array(place))
     oracle = Oracle(lambda points: seen(1, len(points)), np.array([0.0, 0.01]))
-    breaks, _ = find_breaks(seen(1, 4, 4), oracle, hints)
-    assert not len(breaks.gap) and breaks.joined[0, 1, 1] == (part >= 0)
+    crossings, _ = find_crossings(seen(1, 4, 4), oracle, hints)
+    assert not len(crossings.gap) and crossings.joined[0, 1, 1] == (part >= 0)
 
 
 @pytest.mark.parametrize("turn", np.linspace(0, 1.8, 7))
@@ -74,14 +74,14 @@ def test_where_three_outlines_meet_their_directions_are_known(turn):
     def layers(points):
         x, y = (points - middle).T
         part = np.searchsorted(ways - turn, (np.arctan2(y, x) - turn) % (2 * np.pi), side="right").astype(np.int32) - 1
-        return Fronts(part[None], np.full((1, len(part)), -1, np.int32), 1.0 + part[None])
+        return Hits(part[None], np.full((1, len(part)), -1, np.int32), 1.0 + part[None])
 
     centres = np.stack(np.meshgrid(np.arange(5) + 0.5, np.arange(5) + 0.5), -1).reshape(-1, 2)
-    seen = Fronts(*(x.reshape(1, 5, 5) for x in layers(centres)))
-    breaks, _ = find_breaks(seen, Oracle(layers, np.array([0.0, 0.01])))
-    outward = breaks.place - middle
+    seen = Hits(*(x.reshape(1, 5, 5) for x in layers(centres)))
+    crossings, _ = find_crossings(seen, Oracle(layers, np.array([0.0, 0.01])))
+    outward = crossings.place - middle
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    near = (np.abs(breaks.place - 2) <= 0.5).all(1)  # On the sides of the square with the point.
+    near = (np.abs(crossings.place - 2) <= 0.5).all(1)  # On the sides of the square with the point.
     assert near.sum() == 3 and not near.all()
-    np.testing.assert_allclose(np.abs((breaks.tangent * outward).sum(1))[near], 1, atol=1e-3)
-    assert (breaks.tangent == 0).all(1).any()
+    np.testing.assert_allclose(np.abs((crossings.tangent * outward).sum(1))[near], 1, atol=1e-3)
+    assert (crossings.tangent == 0).all(1).any()

@@ -219,7 +219,7 @@ def test_a_needle_reaches_to_its_tip():
 def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over():
     """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
     from rts.outlines.gaps import Gaps
-    from rts.outlines.sheets import Sheets
+    from rts.outlines.seen_mesh import SeenMesh
     from rts.outlines.silhouettes_loops import LARGE
 
     clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
@@ -232,7 +232,7 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
-            own = Sheets(0, np.int32([0, 1]), vertices, faces, none, rows, clip, both, seen, np.int8([LARGE, LARGE]))
+            own = SeenMesh(0, np.int32([0, 1]), vertices, faces, none, rows, clip, both, seen, np.int8([LARGE, LARGE]))
             names, spans, _ = own.spans(Gaps.of(marks), True)
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()

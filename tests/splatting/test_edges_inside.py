@@ -9,7 +9,7 @@ from helpers import pushed, quick
 
 import rts
 from rts.contracts.records import Proxy
-from rts.outlines.sheets import Sheets
+from rts.outlines.seen_mesh import SeenMesh
 from rts.outlines.silhouettes_loops import LARGE
 
 pytestmark = pytest.mark.splatting
@@ -45,7 +45,7 @@ def test_white_walls_fill_the_image_whatever_the_order_of_corners(parts):
 def test_triangles_that_reach_behind_the_camera_are_large(turn):
     """One triangle of the first wall has one corner ahead, and the other has two."""
     faces = WALLS[:, list(turn)].astype(np.int32)
-    sides = Sheets.of(Proxy(CORNERS, faces), CAMERA, SIZE, "none").sides
+    sides = SeenMesh.of(Proxy(CORNERS, faces), CAMERA, SIZE, "none").sides
     np.testing.assert_array_equal(np.abs(sides[:4]), LARGE)
 
 

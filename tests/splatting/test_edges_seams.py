@@ -165,7 +165,7 @@ def test_outlines_are_joined_to_no_seams():
         assert (np.abs(colored - plain) > 1e-4).sum() <= 2
 
 
-def test_where_breaks_have_no_room_outlines_come_first():
+def test_where_crossings_have_no_room_outlines_come_first():
     """A rough ball whose triangles share no vertices, seen by a program, has more seams than that has room for."""
     jax = pytest.importorskip("jax")
     (vertices, faces), size = icosphere(3, 0.8), (48, 48)

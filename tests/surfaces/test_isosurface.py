@@ -266,7 +266,7 @@ def test_samples_beside_outlines_are_joined_to_tables(target, shader):
         assert expected.any() and (target == "numpy" or slope.all())
 
 
-def test_breaks_without_room_in_a_table_are_left_out_and_counted():
+def test_crossings_without_room_in_a_table_are_left_out_and_counted():
     """In few pixels most samples lie beside outlines; the table has room for half of all points."""
     jax = pytest.importorskip("jax")
     size = (10, 10)

@@ -220,7 +220,7 @@ def test_views_lie_in_as_many_pictures_as_are_needed(monkeypatch):
 
 @pytest.mark.filterwarnings("ignore::rts.errors.InputWarning")  # A telephoto lens.
 @pytest.mark.parametrize("make", [crossing, glass])
-def test_lines_of_crossing_move_in_near_views_beside_far_ones(make):
+def test_lines_of_intersection_move_in_near_views_beside_far_ones(make):
     """Depths of views are scaled by different factors, and slopes of depth with them."""
     cameras = [Camera.look_at(np.array(EYES[1]) * k, (0, 0, 0), fov_y=40 / k, far=5000) for k in (1, 100)]
 

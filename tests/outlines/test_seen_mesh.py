@@ -8,8 +8,8 @@ import rts
 from rts.compiling.threads import read_only
 from rts.contracts.records import Proxy
 from rts.outlines import sheets, spans_loops
-from rts.outlines.gaps import Fronts, Gaps
-from rts.outlines.sheets import Sheets
+from rts.outlines.gaps import Gaps, Hits
+from rts.outlines.seen_mesh import SeenMesh
 from rts.scene.camera import Camera
 
 pytestmark = pytest.mark.sampling
@@ -22,27 +22,27 @@ THREE = np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)], np.int32)
 
 
 def of(corners, faces):
-    """The sheets of triangles with these corners, x and y in cells from the upper left corner, at depth 5."""
+    """The patches of triangles with these corners, x and y in cells from the upper left corner, at depth 5."""
     x, y = np.asarray(corners, float).T
     vertices = np.column_stack([x - 4, 4 - y, 0 * x]).astype(np.float32)
-    return Sheets.of(Proxy(vertices, np.asarray(faces, np.int32)), CAMERA, SIZE, "none")
+    return SeenMesh.of(Proxy(vertices, np.asarray(faces, np.int32)), CAMERA, SIZE, "none")
 
 
 def test_two_triangles_are_neighbours_beyond_the_edge_opposite_their_third_corners():
-    np.testing.assert_array_equal(sheets._beyond(TWO), [(-1, -1, 1), (-1, -1, 0)])
+    np.testing.assert_array_equal(sheets._adjacent(TWO), [(-1, -1, 1), (-1, -1, 0)])
 
 
 def test_an_edge_that_three_triangles_share_has_no_neighbours():
-    np.testing.assert_array_equal(sheets._beyond(THREE), np.full((3, 3), -1))
+    np.testing.assert_array_equal(sheets._adjacent(THREE), np.full((3, 3), -1))
 
 
 def test_neighbours_are_kept_for_faces_that_nobody_writes_alone():
     fixed, free = TWO.copy(), TWO.copy()
     fixed.flags.writeable = False
-    assert sheets._beyond(fixed) is sheets._beyond(fixed)
-    assert sheets._beyond(free)[0, 2] == 1
+    assert sheets._adjacent(fixed) is sheets._adjacent(fixed)
+    assert sheets._adjacent(free)[0, 2] == 1
     free[1] = (1, 4, 3)
-    np.testing.assert_array_equal(sheets._beyond(free), np.full((2, 3), -1))
+    np.testing.assert_array_equal(sheets._adjacent(free), np.full((2, 3), -1))
 
 
 def apart(vertices, faces):
@@ -53,14 +53,14 @@ def apart(vertices, faces):
 def test_triangles_that_meet_are_neighbours_where_colours_do_not_tell():
     vertices, faces = icosphere(1)
     proxy, size = Proxy(*apart(vertices.astype(np.float32), faces)), (8, 8)
-    np.testing.assert_array_equal(Sheets.of(proxy, CAMERA, size, "none").beyond, sheets._beyond(faces))
-    assert (Sheets.of(proxy, CAMERA, size, "none", seams=True).beyond == -1).all()
+    np.testing.assert_array_equal(SeenMesh.of(proxy, CAMERA, size, "none").adjacent, sheets._adjacent(faces))
+    assert (SeenMesh.of(proxy, CAMERA, size, "none", seams=True).adjacent == -1).all()
     # A triangle that is moved away has no neighbours, though the others were known before; zeros have no sign.
     moved = proxy.vertices.copy()
     moved[:3] += 1
     moved[moved == 0] = -0.0
-    beyond = Sheets.of(proxy._replace(vertices=moved), CAMERA, size, "none").beyond
-    assert (beyond[0] == -1).all() and (beyond == -1).sum() == 6
+    adjacent = SeenMesh.of(proxy._replace(vertices=moved), CAMERA, size, "none").adjacent
+    assert (adjacent[0] == -1).all() and (adjacent == -1).sum() == 6
 
 
 def test_welds_are_kept_for_faces_that_nobody_writes_while_they_hold():
@@ -109,9 +109,9 @@ def quad(left, top, right, bottom):
 
 
 def marked(own, part):
-    """The gaps, along rows and along columns, that the silhouettes of some sheets meet where `part` is seen."""
+    """The gaps, along rows and along columns, that the silhouettes of some patches meet where `part` is seen."""
     met = np.zeros((2, *SIZE), np.uint8)
-    own.meet(Fronts(part, 0 * part, 5.0 * np.ones(SIZE)), np.array([1.0, 0.0]), met)
+    own.mark_silhouettes(Hits(part, 0 * part, 5.0 * np.ones(SIZE)), np.array([1.0, 0.0]), met)
     return {(axis, y, x) for axis, y, x in np.argwhere(met == 2).tolist()}
 
 
@@ -127,7 +127,7 @@ def test_the_border_of_a_card_meets_the_gaps_that_it_crosses():
 def test_a_fold_is_a_silhouette():
     part = np.full(SIZE, -1, np.int32)
     part[2:5, 2:5] = 0
-    # The second triangle lies on the first: the sheet turns away at x = 4.7, the edge that both have in common.
+    # The second triangle lies on the first: the patch turns away at x = 4.7, the edge that both have in common.
     own = of([(4.7, 2.2), (4.7, 4.8), (0.2, 3.5), (1.2, 3.5)], [(0, 1, 2), (1, 0, 3)])
     assert {(0, y, 4) for y in (2, 3, 4)} <= marked(own, part)
 
@@ -161,7 +161,7 @@ def test_cells_around_a_gap_are_marked():
     np.testing.assert_array_equal(cells.view(np.uint8), expected)
 
 
-def test_sheets_join_the_centres_between_which_they_go_on():
+def test_patches_join_the_centres_between_which_they_go_on():
     part = np.full(SIZE, -1, np.int32)
     part[2:5, 2:6] = 0
     own = of([*quad(2.1, 2.1, 4.1, 4.9), (5.9, 2.1), (5.9, 4.9)], [(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
@@ -172,8 +172,8 @@ def test_sheets_join_the_centres_between_which_they_go_on():
         below = (y - 2.1) / 2.8 > ((x - 2.1) / 2 if left else (x - 4.1) / 1.8)
         triangle[int(y), int(x)] = (1 if below else 0) if left else (3 if below else 2)
     met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
-    fronts = Fronts(read_only(part), read_only(triangle), read_only(5.0 * np.ones(SIZE)))
-    own.meet(fronts, np.array([1.0, 0.0]), met)
+    fronts = Hits(read_only(part), read_only(triangle), read_only(5.0 * np.ones(SIZE)))
+    own.mark_silhouettes(fronts, np.array([1.0, 0.0]), met)
     own.join(fronts, met, joined)
     both = [(part >= 0) & (np.roll(part, -1, axis) >= 0) for axis in (1, 0)]
     np.testing.assert_array_equal(joined, both)

@@ -1,4 +1,4 @@
-"""Fronts along gaps, the nearest spans, and the breaks between them. Compiled.
+"""First hits along gaps, the nearest spans, and the crossings between them. Compiled.
 
 Places and spans are those of `rts.outlines.spans_loops`.
 """
@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, CROSS, SEAM
+from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT, SEAM
 from rts.outlines.spans_loops import TINY
 
 LAST = 4e-5
-"""Distance of last samples from breaks, in cells."""
+"""Distance of last samples from crossings, in cells."""
 
 TOUCH = 1e-6
 """Greatest distance along a gap, and greatest share of the depth, by which the ends of two spans differ where a surface
@@ -102,18 +102,18 @@ def _overtaken(spans, begin, stop, x, place):
 
 
 @compiled(inline="always")
-def _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts):
-    """The fronts along a gap: which span is the nearest, and from which place on. Returns their number.
+def _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts):
+    """The first hits along a gap: which span is the nearest, and from which place on. Returns their number.
 
     Args:
         g: the gap.
         begin: its first span.
         stop: the span after its last.
-        spans: see `breaks`.
-        names: see `breaks`.
-        parts: see `breaks`.
-        ends: see `breaks`.
-        end_depth: see `breaks`.
+        spans: see `crossings`.
+        names: see `crossings`.
+        parts: see `crossings`.
+        ends: see `crossings`.
+        end_depth: see `crossings`.
         pieces: (2 N + 4,) int64 or more for its N spans, to fill: spans, NOTHING, FIRST or SECOND.
         starts: (2 N + 4,) float64 or more, to fill: where they begin.
     """
@@ -183,7 +183,7 @@ def _goes_on(spans, begin, stop, parts, x, place, way):
 
 @compiled(inline="always")
 def _kind(before, behind, nearer, stops, starts):
-    """How a front changes at a place: BEFORE_ENDS, BEHIND_ENDS or CROSS; −1, not at all.
+    """How a front changes at a place: BEFORE_ENDS, BEHIND_ENDS or INTERSECT; −1, not at all.
 
     Where two parts meet at an edge of both, the kind is SEAM.
 
@@ -203,7 +203,7 @@ def _kind(before, behind, nearer, stops, starts):
     elif stops != starts:
         kind = BEFORE_ENDS if stops else BEHIND_ENDS
     elif not stops:
-        kind = CROSS
+        kind = INTERSECT
     elif before != behind:
         kind = SEAM
     return kind
@@ -223,11 +223,11 @@ def is_seam(x, y, first_kind, second_kind, spans):
 
 
 @loop
-def breaks(
+def crossings(
     first, last, gap, begins, spans, names, parts, seen, triangle, depth, ends, end_depth, inner, rows, counts, whole,
     numbers,
 ):  # fmt: skip
-    """Fill in the breaks along gaps, in order.
+    """Fill in the crossings along gaps, in order.
 
     The helpers take these arrays whole, with a gap's number and range of spans: a view of an array costs as much as a
     span, since threads count its references in turns.
@@ -246,12 +246,12 @@ def breaks(
         ends: (M, 2, 2) int32 to fill: part and triangle of the samples at both centres; −1 where nothing is seen.
         end_depth: (M, 2) to fill: their depths.
         inner: distance of the samples that tell colours.
-        rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
-        counts: (M,) to fill: the number of breaks of each gap.
+        rows: (M,) to fill: the row of `whole` and `numbers` where the crossings of each gap begin.
+        counts: (M,) to fill: the number of crossings of each gap.
         whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles
-            of the last samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for
-            its last.
-        numbers: (2 N + 4 M, 5) float64 to fill: place of the break, the last samples, and those that tell colours.
+            of the last samples, of those that tell colours (before, behind), and 1 for the gap's first crossing, and
+            for its last.
+        numbers: (2 N + 4 M, 5) float64 to fill: place of the crossing, the last samples, and those that tell colours.
     """
     most = 4
     for g in range(first, last):
@@ -262,7 +262,7 @@ def breaks(
         for k in range(2):
             y, x = gap[g, 0] + k * (1 - gap[g, 2]), gap[g, 1] + k * gap[g, 2]
             ends[g, k, 0], ends[g, k, 1], end_depth[g, k] = seen[y, x], triangle[y, x], depth[y, x]
-        n = _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts)
+        n = _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts)
         rows[g], count, a = at, 0, 0
         for m in range(1, n):
             # A piece that is too short to count belongs to what comes after it.
@@ -303,29 +303,29 @@ def breaks(
 
 
 @loop
-def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, triangles, ends, joined):
-    """Fill in the fields of `Breaks`, gap after gap, from what `breaks` found with room to spare.
+def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, kind, triangles, ends, joined):
+    """Fill in the fields of `Crossings`, gap after gap, from what `crossings` found with room to spare.
 
     Args:
-        rows: (M,), see `breaks`.
-        counts: (M,), see `breaks`.
+        rows: (M,), see `crossings`.
+        counts: (M,), see `crossings`.
         gap_of: (M, 3), see `Gaps`.
-        whole: see `breaks`.
-        numbers: see `breaks`.
+        whole: see `crossings`.
+        numbers: see `crossings`.
         gap: (B, 3) int32 to fill.
-        points: (B, 5, 2) to fill: x and y of the break, of its last samples, and of those that tell colours.
+        points: (B, 5, 2) to fill: x and y of the crossing, of its last samples, and of those that tell colours.
         parts: (B, 2) int32 to fill.
-        near: (B,) int32 to fill.
+        kind: (B,) int32 to fill.
         triangles: (B, 4) int32 to fill; −1 where nothing is seen.
         ends: (B, 2) bool to fill.
-        joined: (2, H, W) bool, False from then on in gaps with a break: elsewhere one surface goes on.
+        joined: (2, H, W) bool, False from then on in gaps with a crossing: elsewhere one surface goes on.
     """
     b = 0
     for g in range(len(rows)):
         y, x, row = gap_of[g, 0], gap_of[g, 1], gap_of[g, 2]
         joined[1 - row, y, x] &= counts[g] == 0
         for n in range(rows[g], rows[g] + counts[g]):
-            gap[b, 0], gap[b, 1], gap[b, 2], near[b] = y, x, row, whole[n, 1]
+            gap[b, 0], gap[b, 1], gap[b, 2], kind[b] = y, x, row, whole[n, 1]
             for i in range(5):
                 points[b, i, 0], points[b, i, 1] = x + 0.5 + numbers[n, i] * row, y + 0.5 + numbers[n, i] * (1 - row)
             for side in range(2):
@@ -337,7 +337,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, near, trian
 
 @compiled(inline="always")
 def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
-    """Fill in the samples that tell colours of the breaks of a gap, from the row `at`; see `breaks`."""
+    """Fill in the samples that tell colours of the crossings of a gap, from the row `at`; see `crossings`."""
     for b in range(at, at + count):
         before = numbers[b - 1, 0] if b > at else 0.0
         after = numbers[b + 1, 0] if b + 1 < at + count else 1.0

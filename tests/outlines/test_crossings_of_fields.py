@@ -1,4 +1,4 @@
-"""Breaks that are found by samples of the gap, as of fields: where surfaces cross, and which of two ends."""
+"""Crossings that are found by samples of the gap, as of fields: where surfaces intersect, and which of two ends."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The triangles of a part as a camera sees them: sheets that join samples, and what lies where on them."""
+"""The triangles of a part as a camera sees them: patches that join samples, and what lies where on them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
-from rts.outlines.gaps import Fronts, Gaps
+from rts.outlines.gaps import Gaps, Hits
 from rts.sampling.points import near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
 
-class Sheets(NamedTuple):
+class SeenMesh(NamedTuple):
     """The triangles of a part, or of neighbouring parts, as a camera sees them.
 
     Attributes:
@@ -24,8 +24,8 @@ class Sheets(NamedTuple):
         starts: (P + 1,) int32, where the triangles of each part begin.
         vertices: (V, 3) float32.
         faces: (T, 3) int32.
-        beyond: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it, and
-            at seams, if they are wanted.
+        adjacent: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it,
+            and at seams, if they are wanted.
         rows: (4, 4), see `Camera.pixel_rows`.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: (T,) int8, the sign of the determinants on screen of triangles that are kept; 0 for both.
@@ -37,7 +37,7 @@ class Sheets(NamedTuple):
     starts: np.ndarray
     vertices: np.ndarray
     faces: np.ndarray
-    beyond: np.ndarray
+    adjacent: np.ndarray
     rows: np.ndarray
     clip: np.ndarray
     keep: np.ndarray
@@ -60,8 +60,8 @@ class Sheets(NamedTuple):
         proxies: Sequence[Proxy] = (),
         seams: bool = False,
         keep: np.ndarray | None = None,
-    ) -> Sheets:
-        """The sheets of a proxy.
+    ) -> SeenMesh:
+        """The patches of a proxy.
 
         Args:
             proxy: the triangles.
@@ -70,53 +70,63 @@ class Sheets(NamedTuple):
             cull: as in `TriangleSampler.rasterize`.
             first: the index of the first part.
             proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; none for one.
-            seams: whether sheets end at seams (`Proxy.corners`), too.
+            seams: whether patches end at seams (`Proxy.corners`), too.
             keep: see above; None for what `cull` says.
         """
-        from rts.outlines import sheets_loops, silhouettes_loops
+        from rts.outlines import seen_mesh_loops, silhouettes_loops
         from rts.sampling.packing_loops import in_one
 
         # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
-        parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=4 * len(seen))
+        parallel(seen_mesh_loops.projected, len(seen), vertices, rows, seen, work=4 * len(seen))
         every, sides = proxies or [proxy], np.zeros(len(faces) + 1, np.int8)
         if seams:
             tables = [x.faces if x.corners is None else x.corners for x in every]
-        else:  # Of one colour triangles that meet are one sheet, whether they share their vertices or not.
+        else:  # Of one colour triangles that meet are one patch, whether they share their vertices or not.
             tables = [_welded(x.vertices, x.faces) for x in every]
             if any(table is not x.faces for table, x in zip(tables, every, strict=True)):
                 shifts = [0, *itertools.accumulate(len(x.vertices) for x in every)][:-1]
                 faces = read_only(tables[0] if len(tables) == 1 else in_one(tables, shifts), np.int32)
         starts = np.array([0, *itertools.accumulate(map(len, tables))], np.int32)
-        beyond = [_beyond(table) for table in tables]
-        beyond = beyond[0] if len(beyond) == 1 else in_one(beyond, starts[:-1].tolist())
+        adjacent = [_adjacent(table) for table in tables]
+        adjacent = adjacent[0] if len(adjacent) == 1 else in_one(adjacent, starts[:-1].tolist())
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))
         keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
-        return cls(first, starts, vertices, faces, beyond, rows, near_and_far(camera), keep, seen, sides)
+        return cls(first, starts, vertices, faces, adjacent, rows, near_and_far(camera), keep, seen, sides)
 
-    def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
-        """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.
+    def mark_silhouettes(self, hits: Hits, width: np.ndarray, met: np.ndarray) -> None:
+        """Mark, in `met` (2, H, W) uint8, the gaps where a patch may end or turn away; see the loop of this name.
 
-        `fronts` (H, W) are seen at centres; for `width` see `Oracle`.
+        `hits` (H, W) are seen at centres; for `width` see `Oracle`.
         """
         from rts.outlines import silhouettes_loops
 
         mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
-        seen_by = self.clip[0], self.keep, self.seen, self.beyond, self.sides
-        parallel(silhouettes_loops.meet, count, *mesh, *seen_by, fronts.part, fronts.depth, width, met, work=10 * count)
+        seen_by = self.clip[0], self.keep, self.seen, self.adjacent, self.sides
+        parallel(
+            silhouettes_loops.mark_silhouettes,
+            count,
+            *mesh,
+            *seen_by,
+            hits.part,
+            hits.depth,
+            width,
+            met,
+            work=10 * count,
+        )
 
-    def join(self, fronts: Fronts, met: np.ndarray, joined: np.ndarray) -> None:
-        """Mark, in `joined` (2, H, W), the centres whose fronts, of one of the parts, a sheet joins to the next ones'.
+    def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
+        """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
 
-        `fronts` (H, W) are seen at centres; for `met` see `meet`.
+        `hits` (H, W) are seen at centres; for `met` see `mark_silhouettes`.
         """
-        from rts.outlines import sheets_loops
+        from rts.outlines import seen_mesh_loops
 
-        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
+        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.adjacent), len(joined[0])
         part_range = np.int32(self.parts.start), np.int32(self.parts.stop)
-        arguments = *map(read_only, fronts), part_range, *mesh, self.keep, met, joined
-        parallel(sheets_loops.seams, height, *arguments, work=8 * joined[0].size)
+        arguments = *map(read_only, hits), part_range, *mesh, self.keep, met, joined
+        parallel(seen_mesh_loops.seams, height, *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
@@ -133,7 +143,7 @@ class Sheets(NamedTuple):
         begins, total = ends - most, int(ends[-1]) if len(ends) else 0
         names, spans = np.empty((total, 3), np.int32), np.empty((total, 9 if seams else 6))
         names[:, 0] = -1
-        mesh = self.rows, self.vertices, self.faces, self.beyond, self.clip, self.keep, self.seen
+        mesh = self.rows, self.vertices, self.faces, self.adjacent, self.clip, self.keep, self.seen
         arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
         part = self.starts[1:-1].searchsorted(names[:, 1], "right") + self.first
@@ -141,12 +151,12 @@ class Sheets(NamedTuple):
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> Fragments:
         """Fragments (1, 1, M) of triangles (M,) at points (M, 2)."""
-        from rts.outlines import sheets_loops
+        from rts.outlines import seen_mesh_loops
 
         count = len(triangle)
         weights, depth = np.empty((count, 2), np.float32), np.empty(count, np.float32)
         arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth
-        parallel(sheets_loops.on_planes, count, *arguments, work=50 * count)
+        parallel(seen_mesh_loops.on_planes, count, *arguments, work=50 * count)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None])
 
     def edges(
@@ -159,7 +169,7 @@ class Sheets(NamedTuple):
         depth: np.ndarray,
         tangent: np.ndarray,
     ) -> None:
-        """Fill in what the triangles tell of the edges at breaks; see `silhouettes_loops.edges`."""
+        """Fill in what the triangles tell of the edges at crossings; see `silhouettes_loops.edges`."""
         from rts.outlines import silhouettes_loops
 
         own, mesh = (np.int32(self.parts.start), np.int32(self.parts.stop)), (self.rows, self.vertices, self.faces)
@@ -210,9 +220,9 @@ def _first_in_place(vertices: np.ndarray) -> np.ndarray:
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 
-def _beyond(faces: np.ndarray) -> np.ndarray:
-    """`Sheets.beyond`; that of a read-only table that owns its memory is kept as long as the table."""
-    from rts.outlines import sheets_loops
+def _adjacent(faces: np.ndarray) -> np.ndarray:
+    """`SeenMesh.adjacent`; that of a read-only table that owns its memory is kept as long as the table."""
+    from rts.outlines import seen_mesh_loops
 
     kept, key = not faces.flags.writeable and faces.flags.owndata, id(faces)
     if kept and key in _known and _known[key][0]() is faces:
@@ -220,7 +230,7 @@ def _beyond(faces: np.ndarray) -> np.ndarray:
     table = np.ascontiguousarray(faces, np.int32)
     edges = np.sort(table[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
-    found = sheets_loops.neighbours(table, order)
+    found = seen_mesh_loops.neighbours(table, order)
     if kept:
         _known[key] = weakref.ref(faces, lambda _: _known.pop(key, None)), found
     return found

@@ -1,4 +1,4 @@
-"""Sheets of triangles in the image: walks from triangle to triangle, and the planes of triangles. Compiled.
+"""Connected patches of triangles in the image: walks from triangle to triangle, and the planes of triangles. Compiled.
 
 Corners and edge functions are those of `rts.sampling.points_loops`.
 """
@@ -74,10 +74,10 @@ def _meets(ax, ay, bx, by):
 
 
 @compiled(inline="always")
-def _walked(t, target, start, axis, at, seen, faces, beyond):
+def _walked(t, target, start, axis, at, seen, faces, adjacent):
     """The triangle that a walk from triangle to triangle, a cell along a line of centres, ends on.
 
-    It ends before that, with −1, where the sheet ends, turns away, or reaches behind the camera.
+    It ends before that, with −1, where the patch ends, turns away, or reaches behind the camera.
 
     Args:
         t: the first triangle, which the line meets at `start`.
@@ -87,7 +87,7 @@ def _walked(t, target, start, axis, at, seen, faces, beyond):
         at: the line's place along the other axis.
         seen: (V, 2), see `projected`.
         faces: (T, 3).
-        beyond: (T, 3).
+        adjacent: (T, 3).
     """
     out, place, first, second = -1, -np.inf, faces[t, 1], faces[t, 2]
     # The edge that the line goes out through, opposite the corner `out`.
@@ -107,7 +107,7 @@ def _walked(t, target, start, axis, at, seen, faces, beyond):
     for _ in range(STEPS):
         if place >= start + 1:
             return t
-        s = beyond[t, out]
+        s = adjacent[t, out]
         if s < 0 or s == target:
             return s
         third = faces[s, 0] ^ faces[s, 1] ^ faces[s, 2] ^ first ^ second
@@ -121,7 +121,7 @@ def _walked(t, target, start, axis, at, seen, faces, beyond):
         second, bx, by = (third, cx, cy) if stays else (second, bx, by)
         before, place = place, _meets(ax, ay, bx, by)
         if place < before:
-            return np.int32(-1)  # The triangle lies on the same side of the edge: the sheet turns away.
+            return np.int32(-1)  # The triangle lies on the same side of the edge: the patch turns away.
         t, out = s, 1 if faces[s, 1] == left else (2 if faces[s, 2] == left else 0)
     return np.int32(-1)
 
@@ -137,8 +137,8 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, beyond, keep, met, joined):
-    """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
+def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, adjacent, keep, met, joined):
+    """Mark neighbouring centres, in lines `first` to `last`, whose first hits are joined by a patch of triangles.
 
     Args:
         first: the first line.
@@ -151,7 +151,7 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        beyond: (T, 3), the result of `neighbours`.
+        adjacent: (T, 3), the result of `neighbours`.
         keep: (T,), see `spans_loops.spans_of`: where one side of triangles is seen, two that share an edge do not fold.
         met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.meet`.
         joined: (2, H, W) or (2, K H, W) bool to fill: along x, and along y.
@@ -174,14 +174,14 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s
-                next_ = keep[t] != 0 and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
-                # Around a corner that two triangles have in common the sheet neither ends nor turns away.
+                next_ = keep[t] != 0 and (adjacent[t, 0] == s or adjacent[t, 1] == s or adjacent[t, 2] == s)
+                # Around a corner that two triangles have in common the patch neither ends nor turns away.
                 if not next_ and (met[axis, line, x] != 0 or not _touch(faces, t, s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
-                    end = _walked(t, s, start, axis, at, seen, faces, beyond)
+                    end = _walked(t, s, start, axis, at, seen, faces, adjacent)
                 joined[axis, y, x] = end == s
                 if end >= 0 and end != s and _touch(faces, end, s):
-                    # Rounding may tell neighbours apart; sheets that pass through one another share no corner.
+                    # Rounding may tell neighbours apart; patches that pass through one another share no corner.
                     sign, there = corners_of(end, rows, vertices, faces, corners), depth[y + dy, x + dx]
                     z = plane_at(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
                     joined[axis, y, x] = abs(z - there) <= 1e-5 * abs(there)
