@@ -89,7 +89,7 @@ def limited(
         crossings, stacks = find(False)
     left_out = count - min(most, len(crossings.gap))
     warn(
-        f"{left_out} crossings of outlines find no room beside {most}, and edges there neither move nor are smooth; "
+        f"{left_out} edge crossings find no room beside {most}, and edges there neither move nor are smooth; "
         f"give the compiled program capacity={4 * count} or more",
         InputWarning,
     )

@@ -78,7 +78,7 @@ def test_pairs_lie_on_the_rays_of_crossings():
     part = rts.Part(rts.Sdf(diamond, 1.6), {"radius": np.float32(0.7)}, "silhouette")
     sampled, outlines = sampled_with_outlines(part, CAMERA, (SIZE, SIZE), splatter="edges")
     points, pair = sampled.samples[0].params[:, :3].astype(float), outlines.rows[:, 4:]
-    ending = outlines.rows[np.arange(len(outlines.near)), outlines.near]
+    ending = outlines.rows[np.arange(len(outlines.kind)), outlines.kind]
     assert (pair >= 0).all()
 
     def seen(rows):

@@ -211,10 +211,10 @@ def paired(name, way):
 def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
     outlines, pairs, places = paired("torus across", way)
     pair = outlines.rows[:, 4:]
-    there, index = pair[:, 0] >= 0, np.arange(len(outlines.near))
+    there, index = pair[:, 0] >= 0, np.arange(len(outlines.kind))
     # Rays leave a band where pixels are wider than cells.
     assert there.mean() > (0.1 if way == "band" else 0.9) and (pair[~there] == -1).all()
-    last = places[outlines.rows[index, np.minimum(outlines.near, 1)]]
+    last = places[outlines.rows[index, np.minimum(outlines.kind, 1)]]
     for side in (0, 1):
         np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)
         assert (pairs[there, side, 2] > last[there, 2] - 1e-4).all()

@@ -204,7 +204,7 @@ def test_samples_and_crossings_without_room_are_counted(monkeypatch):
     assert np.isfinite(np.asarray(rts.render_samples(few, parts(poses), CAMERA))).all()
     crossings = len(outlines.place)
     monkeypatch.setattr(of_traced, "most_crossings", lambda grid, capacity: 30)
-    message = f"{crossings - 30} crossings of outlines find no room beside 30, .* program capacity={4 * crossings}"
+    message = f"{crossings - 30} edge crossings find no room beside 30, .* program capacity={4 * crossings}"
     with pytest.warns(rts.errors.InputWarning, match=message):
         few = jax.block_until_ready(jax.jit(lambda p: rts.sample(parts(p), CAMERA, SIZE))(poses))
     assert int(few.overflow) == crossings - 30

@@ -7,7 +7,7 @@ from helpers import icosphere
 import rts
 from rts.compiling.threads import read_only
 from rts.contracts.records import Proxy
-from rts.outlines import sheets, spans_loops
+from rts.outlines import seen_mesh, spans_loops
 from rts.outlines.gaps import Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
 from rts.scene.camera import Camera
@@ -29,20 +29,20 @@ def of(corners, faces):
 
 
 def test_two_triangles_are_neighbours_beyond_the_edge_opposite_their_third_corners():
-    np.testing.assert_array_equal(sheets._adjacent(TWO), [(-1, -1, 1), (-1, -1, 0)])
+    np.testing.assert_array_equal(seen_mesh._adjacent(TWO), [(-1, -1, 1), (-1, -1, 0)])
 
 
 def test_an_edge_that_three_triangles_share_has_no_neighbours():
-    np.testing.assert_array_equal(sheets._adjacent(THREE), np.full((3, 3), -1))
+    np.testing.assert_array_equal(seen_mesh._adjacent(THREE), np.full((3, 3), -1))
 
 
 def test_neighbours_are_kept_for_faces_that_nobody_writes_alone():
     fixed, free = TWO.copy(), TWO.copy()
     fixed.flags.writeable = False
-    assert sheets._adjacent(fixed) is sheets._adjacent(fixed)
-    assert sheets._adjacent(free)[0, 2] == 1
+    assert seen_mesh._adjacent(fixed) is seen_mesh._adjacent(fixed)
+    assert seen_mesh._adjacent(free)[0, 2] == 1
     free[1] = (1, 4, 3)
-    np.testing.assert_array_equal(sheets._adjacent(free), np.full((2, 3), -1))
+    np.testing.assert_array_equal(seen_mesh._adjacent(free), np.full((2, 3), -1))
 
 
 def apart(vertices, faces):
@@ -53,7 +53,7 @@ def apart(vertices, faces):
 def test_triangles_that_meet_are_neighbours_where_colours_do_not_tell():
     vertices, faces = icosphere(1)
     proxy, size = Proxy(*apart(vertices.astype(np.float32), faces)), (8, 8)
-    np.testing.assert_array_equal(SeenMesh.of(proxy, CAMERA, size, "none").adjacent, sheets._adjacent(faces))
+    np.testing.assert_array_equal(SeenMesh.of(proxy, CAMERA, size, "none").adjacent, seen_mesh._adjacent(faces))
     assert (SeenMesh.of(proxy, CAMERA, size, "none", seams=True).adjacent == -1).all()
     # A triangle that is moved away has no neighbours, though the others were known before; zeros have no sign.
     moved = proxy.vertices.copy()
@@ -67,14 +67,14 @@ def test_welds_are_kept_for_faces_that_nobody_writes_while_they_hold():
     vertices, faces = apart(*icosphere(0))
     faces = faces.copy()
     faces.flags.writeable = False
-    found = sheets._welded(vertices, faces)
-    assert found is not faces and sheets._welded(vertices + 1, faces) is found
+    found = seen_mesh._welded(vertices, faces)
+    assert found is not faces and seen_mesh._welded(vertices + 1, faces) is found
     vertices[0] += 1
-    assert len(np.unique(sheets._welded(vertices, faces))) == len(np.unique(found)) + 1
+    assert len(np.unique(seen_mesh._welded(vertices, faces))) == len(np.unique(found)) + 1
     scattered = np.random.default_rng(0).normal(size=vertices.shape)
-    assert sheets._welded(scattered, faces) is faces
+    assert seen_mesh._welded(scattered, faces) is faces
     shared, own = icosphere(1)
-    assert sheets._welded(shared, own) is own
+    assert seen_mesh._welded(shared, own) is own
 
 
 @pytest.mark.parametrize("parts", [1, 2])

@@ -34,7 +34,7 @@ def segments_between(gap, place, kind):
     return loops.segments_of(order, dual, dual, ends, place, np.zeros((len(place), 2)), np.zeros(len(place)), WIDTH)
 
 
-@pytest.mark.parametrize("near", [0, 1])
+@pytest.mark.parametrize("kind", [0, 1])
 def test_a_segment_starts_where_the_way_clockwise_leaves_the_front(kind):
     """An outline from top to bottom through the dual cell (1, 1); what ends lies on its left, or on its right."""
     _, endpoints, side, _ = segments_between([(1, 1, 1), (2, 1, 1)], [(1.8, 1.5), (1.8, 2.5)], [kind, kind])

@@ -136,6 +136,6 @@ def test_surfaces_that_pass_through_one_another_give_one_image_in_any_order(opaq
         colors = np.tile([n / 5, 1 - n / 5, 0.5, 1.0 if opaque else 0.6], (3, 1))
         parts.append(rts.Part(mesh, {"vertices": vertices, "colors": colors}, shader))
     image = rts.render(parts, in_pixels(), SIZE)
-    assert (sampled_with_outlines(parts, in_pixels(), SIZE)[1].near == 2).sum() > 10
+    assert (sampled_with_outlines(parts, in_pixels(), SIZE)[1].kind == 2).sum() > 10
     for order in ([5, 4, 3, 2, 1, 0], [2, 0, 4, 5, 1, 3]):
         np.testing.assert_allclose(rts.render([parts[i] for i in order], in_pixels(), SIZE), image, rtol=0, atol=1e-6)

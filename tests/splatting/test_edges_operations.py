@@ -111,7 +111,7 @@ def unseen():
 
 def test_scenes_have_pairs_and_lines_of_intersection():
     for name in ("bodies", "panes"):
-        assert (drawn(name)[1].near == 2).any()
+        assert (drawn(name)[1].kind == 2).any()
     assert (drawn("a field")[1].rows[:, 4:] >= 0).any()
 
 

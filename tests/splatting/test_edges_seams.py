@@ -178,7 +178,7 @@ def test_where_crossings_have_no_room_outlines_come_first():
     def drawn(vertices):
         return rts.render(part.replace(theta={"vertices": vertices}), CAMERA, size)
 
-    with pytest.warns(rts.errors.InputWarning, match="breaks of outlines find no room beside"):
+    with pytest.warns(rts.errors.InputWarning, match="edge crossings find no room beside"):
         image = np.asarray(drawn(jax.numpy.asarray(vertices)))
     plain = np.asarray(rts.render(part.replace(shader="silhouette"), CAMERA, size))
     np.testing.assert_allclose(image[..., 3], plain[..., 3], atol=1e-5)

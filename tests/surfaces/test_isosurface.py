@@ -288,7 +288,7 @@ def test_crossings_without_room_in_a_table_are_left_out_and_counted():
         return *results, len(outlines.place)
 
     none, seen, _, every = sampled(True)
-    with pytest.warns(rts.errors.InputWarning, match="breaks of outlines find no room beside"):
+    with pytest.warns(rts.errors.InputWarning, match="edge crossings find no room beside"):
         left, still, image, fewer = sampled(room)
     assert (still == seen).all() and none == 0 and left == every - fewer > 0 < fewer and np.isfinite(image).all()
 
