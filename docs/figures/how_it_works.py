@@ -109,10 +109,9 @@ def sampled_cards() -> tuple[Any, Any, np.ndarray]:
     """Samples of the cards; the outlines that their stencil is made of, which nothing hands on; and cells."""
     found, whole = [], Outlines.stencil
 
-    def stencil(self: Any, starts: np.ndarray, row: np.ndarray, *told: Any) -> Any:
-        rows = np.where(self.rows >= 0, self.rows + starts[self.parts], -1)
-        found.append((self._replace(rows=rows), row))
-        return whole(self, starts, row, *told)
+    def stencil(self: Any, row: np.ndarray, *required: Any) -> Any:
+        found.append((self, row))
+        return whole(self, row, *required)
 
     parts, camera = cards()
     with mock.patch.object(Outlines, "stencil", stencil):
@@ -121,13 +120,13 @@ def sampled_cards() -> tuple[Any, Any, np.ndarray]:
 
 
 def chosen_crossing(found: Any, apron: int, y: int, x: int) -> int:
-    """The index of the break in the gap along the row from pixel (y, x)."""
+    """The index of the crossing in the gap along the row from pixel (y, x)."""
     [(index,)] = np.argwhere((found.gap == (y + apron, x + apron, 1)).all(axis=1))
     return int(index)
 
 
 def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
-    """Centres, gaps, breaks and segments, as the library finds them."""
+    """Centres, gaps, crossings and segments, as the library finds them."""
     bare(axes, "centres see the near card or the far one;\nbetween unlike neighbours lies a gap")
     corner = np.array([(x + SIDE / 2, SIDE / 2 - y) for x, y, _ in CARD])
     axes.fill(*corner.T, fc="#D55E0022", ec="none")
@@ -144,7 +143,7 @@ def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
     for y, x in np.ndindex(SIDE, SIDE):
         shown = ORANGE if near.contains_point((x + 0.5, y + 0.5)) else BLUE
         axes.plot(x + 0.5, y + 0.5, "o", ms=4.5, color=shown, zorder=4)
-    for endpoints, square, turn in zip(found.endpoints, found.square, found.corner, strict=True):
+    for square, endpoints, turn in zip(*found.segments[:2], found.segments.corner, strict=True):
         bend = square[::-1] - apron + 0.5 + turn
         path = np.stack([place[endpoints[0]], bend, place[endpoints[1]]])
         axes.plot(*path.T, color=INK, lw=1.6, zorder=3)
@@ -154,7 +153,7 @@ def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
 
 def seen_from_above(axes: Any, place: float, inner: tuple[float, float]) -> None:
     """A section along a gap: the samples that it has."""
-    bare(axes, "one gap from above, the eye on top:\nits break, and samples beside it")
+    bare(axes, "one gap from above, the eye on top:\nits crossing, and samples beside it")
     axes.plot((-0.45, place), (0.6, 0.6), color=ORANGE, lw=2)
     axes.plot((-0.45, 1.45), (1.5, 1.5), color=BLUE, lw=2)
     for x in (0, 1):
@@ -167,9 +166,9 @@ def seen_from_above(axes: Any, place: float, inner: tuple[float, float]) -> None
     axes.plot(place, 0.1, "D", ms=5, mfc="white", mec=INK)
     axes.text(0, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
     axes.text(1, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
-    axes.text(place, 0.0, "break", ha="center", va="bottom", fontsize=8, color=INK)
+    axes.text(place, 0.0, "crossing", ha="center", va="bottom", fontsize=8, color=INK)
     axes.annotate("", (place + 0.3, 0.6), (place + 0.05, 0.6), arrowprops={"arrowstyle": "-|>", "color": ORANGE})
-    axes.text(place + 0.07, 0.72, "the last sample:\nthe break moves\nas it does", va="top", fontsize=8, color=ORANGE)
+    axes.text(place + 0.07, 0.72, "the last sample:\nthe crossing moves\nas it does", va="top", fontsize=8, color=ORANGE)
     axes.text(-0.4, 1.62, "hollow: samples a little farther in tell the colours", va="top", fontsize=8, color=PALE)
     axes.set(xlim=(-0.5, 1.5), ylim=(1.85, -0.2))
 

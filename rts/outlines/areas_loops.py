@@ -320,19 +320,19 @@ def _add_boundary_terms(s, first, terms, dual, width, endpoints, adjacent, shown
 
 
 @compiled
-def add_dual_cells(
-    begin, end, place, gap, dual, endpoints, dual_sides, junction, adjacent, corner, pull, at_centres, shown,
-    movers, moves, colors, parts, motions, speeds,
-):  # fmt: skip
+def add_dual_cells(begin, end, outlines, shown, at_centres, entries):
     """Add the entries of segments, dual cell after dual cell, of those that have cells in lines `begin` to `end`.
 
     From each crossing on a dual cell's sides a ray goes to a junction inside: the corner of its segment, or of the one
-    that this ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops`.
+    that this ends at or crosses. Between the rays lie regions. Other arguments as of `_add_sides`.
 
     Returns:
         The numbers of entries of colours, and of motions.
     """
     width, most, stop, first, n, m = at_centres.shape[1], 1, 0, 0, 0, 0
+    (dual, endpoints, dual_sides, junction, adjacent, corner, pull), gap = outlines.segments, outlines.gap
+    place, beside, movers, moves = outlines.place, shown.colors, shown.movers, shown.moves
+    colors, parts, motions, speeds = entries
     for s in range(1, len(dual)):  # The most segments of one dual cell.
         stop = stop if dual[s, 0] == dual[stop, 0] and dual[s, 1] == dual[stop, 1] else s
         most = max(most, s + 1 - stop)
@@ -382,12 +382,12 @@ def add_dual_cells(
                 y, x = dual[first, 0] + (k >= 2), dual[first, 1] + (k == 1 or k == 2)
                 n = _add_areas(
                     count, order, sides, crossings, junctions, region, weight, length, area, of_junction, k,
-                    y * width + x, at_centres[y, x], shown, colors, parts, n,
+                    y * width + x, at_centres[y, x], beside, colors, parts, n,
                 )  # fmt: skip
         for s in range(first, stop):
             if endpoints[s, 0] != endpoints[s, 1]:
                 m = _add_boundary_terms(
-                    s, first, terms, dual, width, endpoints, adjacent, shown, movers, moves, motions, speeds, m
+                    s, first, terms, dual, width, endpoints, adjacent, beside, movers, moves, motions, speeds, m
                 )
         first = stop
     return n, m

@@ -11,7 +11,7 @@ import numpy as np
 from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
 from rts.outlines.gaps import Crossings
-from rts.outlines.segments import joined
+from rts.outlines.segments import Segments, joined
 from rts.sampling.entries import is_still
 from rts.sampling.scene import Scene
 
@@ -37,20 +37,7 @@ class Outlines(NamedTuple):
             on and its colours may change. Of several layers it is about the one that ends there.
         slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `kind` is INTERSECT; else 0.
         ends: (B, 2) bool: is this the gap's first crossing, and its last?
-        dual: (S, 2) int32, the first corner (y, x) of each segment's dual cell.
-        endpoints: (S, 2) int32, the two crossings of each segment; the near surface lies to the right of the way from
-            one to the other. −1 in second place if a crossing is alone. Segments of one dual cell follow one another.
-        dual_sides: (S, 2) int32, the sides of the dual cell that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
-        junction: (S,) int32, how many rows farther on there is the segment, of the same dual cell, that the outline of
-            a lone crossing ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `adjacent`
-            has the crossings of that segment, and `pull` weights of their motions, first and last, whose sum is about
-            the motion of that segment's corner. Lone crossings with no segment beside them have the first of them as
-            their junction.
-        adjacent: (S, 2) int32, the crossings along the same outline before and after these two; −1 for none.
-        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the dual cell's first
-            centre.
-        pull: (S, 4) float64, weights of the motions of the crossing before, of these two, and of the one after, whose
-            sum is the motion of the corner.
+        segments: see `Segments`.
         joined: (2, H, W) bool, see `Stencil`.
         left_out: number of crossings left out for want of room.
     """
@@ -62,13 +49,7 @@ class Outlines(NamedTuple):
     kind: np.ndarray
     slope: np.ndarray
     ends: np.ndarray
-    dual: np.ndarray
-    endpoints: np.ndarray
-    dual_sides: np.ndarray
-    junction: np.ndarray
-    adjacent: np.ndarray
-    corner: np.ndarray
-    pull: np.ndarray
+    segments: Segments
     joined: np.ndarray
     left_out: int
 
@@ -83,7 +64,7 @@ class Outlines(NamedTuple):
         layered = sides is not None
         sides = np.empty((count, 2, 0), np.int32) if sides is None else sides
         of_crossings = place, crossings.gap, kind, crossings.slope, crossings.ends
-        return cls(rows, sides, *of_crossings, *joined(crossings, layered), crossings.joined, left_out)
+        return cls(rows, sides, *of_crossings, joined(crossings, layered), crossings.joined, left_out)
 
     def stencil(self, row: np.ndarray, required: Required, real: Any) -> Stencil:
         """The areas and boundary terms beside outlines, whose `rows` are counted over all parts.
@@ -103,10 +84,8 @@ class Outlines(NamedTuple):
             samples = last, last, none, stack
         else:
             samples = *self._colored(rows, row[0], required), rows[:, 4:], self.sides
-        of_crossings = self.place, self.gap, self.kind, self.slope, self.ends, *map(np.ascontiguousarray, samples)
-        of_segments = self.dual, self.endpoints, self.dual_sides, self.junction, self.adjacent, self.corner, self.pull
-        arrays: Any = *of_crossings, *of_segments, self.joined, read_only(row, np.int32), real
-        found: Any = loops.entries(*arrays)
+        beside = loops.Beside(*map(np.ascontiguousarray, samples))
+        found: Any = loops.entries(self, beside, read_only(row, np.int32), real)
         (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
         stacks = stacks if self.sides.shape[2] else None
         return Stencil(self.joined, cell, sample, weight, moved_cell, mover, rates, jumps, stacks)

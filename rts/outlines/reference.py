@@ -49,17 +49,23 @@ class Ray(NamedTuple):
 def rays_of(outlines: Outlines, dual: tuple[int, int]) -> list[Ray]:
     """The rays in a dual cell, whose first corner is the cell (y, x), clockwise by where they start."""
     rays = []
-    for s in np.flatnonzero((outlines.dual == dual).all(axis=1)):
-        first, second = outlines.endpoints[s]
-        for endpoint, side in zip(outlines.endpoints[s], outlines.dual_sides[s], strict=True):
+    for s in np.flatnonzero((outlines.segments.dual == dual).all(axis=1)):
+        first, second = outlines.segments.endpoints[s]
+        for endpoint, side in zip(outlines.segments.endpoints[s], outlines.segments.dual_sides[s], strict=True):
             if endpoint < 0 or first == second:
                 continue
             y, x, along = outlines.gap[endpoint] - [*dual, 0]
             start = np.clip(np.array([x, y]) + outlines.place[endpoint] * np.array([along, 1 - along]), 0.0, 1.0)
             place = (start[0], 1 + start[1], 3 - start[0], 4 - start[1])[side]
-            junction = int(s + outlines.junction[s])
+            junction = int(s + outlines.segments.junction[s])
             rays.append(
-                Ray(place, int(endpoint), int(side), junction, [start, outlines.corner[s], outlines.corner[junction]])
+                Ray(
+                    place,
+                    int(endpoint),
+                    int(side),
+                    junction,
+                    [start, outlines.segments.corner[s], outlines.segments.corner[junction]],
+                )
             )
     return _merged(
         sorted(rays, key=lambda ray: (ray.side, ray.place, ray.endpoint if ray.side < 2 else -ray.endpoint)), outlines
@@ -76,7 +82,7 @@ def _merged(rays: list[Ray], outlines: Outlines) -> list[Ray]:
             other.junction for other in [*rays[:last], *rays[i + 1 :]]
         }
         for junction in crossing - {ray.junction}:
-            end = outlines.corner[ray.junction]
+            end = outlines.segments.corner[ray.junction]
             rays = [
                 x._replace(junction=ray.junction, path=[*x.path, end]) if x.junction == junction else x for x in rays
             ]
@@ -197,12 +203,14 @@ def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> 
     found: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(2))
     for corner, (right, down) in enumerate(CORNERS.astype(int)):
         dual = cell[0] - down, cell[1] - right
-        segments = np.flatnonzero((outlines.dual == dual).all(axis=1) & (np.diff(outlines.endpoints)[:, 0] != 0))
-        leaders = [s + outlines.junction[s] for s in segments]
+        segments = np.flatnonzero(
+            (outlines.segments.dual == dual).all(axis=1) & (np.diff(outlines.segments.endpoints)[:, 0] != 0)
+        )
+        leaders = [s + outlines.segments.junction[s] for s in segments]
         for s in segments:
-            endpoints = [endpoint for endpoint in outlines.endpoints[s] if endpoint >= 0]
-            alone = len(endpoints) == 2 and leaders.count(s + outlines.junction[s]) == 1
-            signs = [1 if side < 2 else -1 for side in outlines.dual_sides[s]]
+            endpoints = [endpoint for endpoint in outlines.segments.endpoints[s] if endpoint >= 0]
+            alone = len(endpoints) == 2 and leaders.count(s + outlines.segments.junction[s]) == 1
+            signs = [1 if side < 2 else -1 for side in outlines.segments.dual_sides[s]]
             for e, endpoint in enumerate(endpoints):
                 for start, end, t, motion in _pieces(outlines, int(s), e, dual):
                     sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
@@ -229,29 +237,31 @@ def _pieces(
 
     These are where it lies between crossing and corner, 0 to 1, and its motion, as weights of those of crossings.
     """
-    h = int(s + outlines.junction[s])
+    h = int(s + outlines.segments.junction[s])
     first, second = (
-        outlines.endpoints[s, 0],
-        outlines.endpoints[s, 1] if outlines.endpoints[s, 1] >= 0 else outlines.endpoints[s, 0],
+        outlines.segments.endpoints[s, 0],
+        outlines.segments.endpoints[s, 1]
+        if outlines.segments.endpoints[s, 1] >= 0
+        else outlines.segments.endpoints[s, 0],
     )
-    pulling = outlines.adjacent[s, 0], *outlines.endpoints[s], outlines.adjacent[s, 1]
+    pulling = outlines.segments.adjacent[s, 0], *outlines.segments.endpoints[s], outlines.segments.adjacent[s, 1]
 
     def at(b: int) -> np.ndarray:
         y, x, along = outlines.gap[b] - [*dual, 0]
         return np.clip(np.array([x, y]) + outlines.place[b] * np.array([along, 1 - along]), 0.0, 1.0)
 
-    last = outlines.pull[s]
+    last = outlines.segments.pull[s]
     if h == s:
         middle = along = last
     else:
         # The ray runs along the segment that it ends at from where it meets that, and moves as that does.
-        ends = [at(b if b >= 0 else outlines.endpoints[h, 0]) for b in outlines.endpoints[h]]
-        (t, near), (u, far) = (_nearest(end, outlines.corner[h], outlines.corner[s]) for end in ends)
+        ends = [at(b if b >= 0 else outlines.segments.endpoints[h, 0]) for b in outlines.segments.endpoints[h]]
+        (t, near), (u, far) = (_nearest(end, outlines.segments.corner[h], outlines.segments.corner[s]) for end in ends)
         t, own = (t, 0) if near <= far else (u, 3)
-        share, _ = _nearest(at(first), at(second), outlines.corner[s])
+        share, _ = _nearest(at(first), at(second), outlines.segments.corner[s])
         middle = np.array([0, 1 - share, share, 0])
         along = t * last + (1 - t) * np.eye(4)[own]
-    points = at(outlines.endpoints[s, e]), outlines.corner[s], outlines.corner[h]
+    points = at(outlines.segments.endpoints[s, e]), outlines.segments.corner[s], outlines.segments.corner[h]
     found = []
     for i, (before, behind) in enumerate(((np.eye(4)[1 + e], middle), (along, last))):
         way = points[i + 1] - points[i]

@@ -11,16 +11,23 @@ from rts.outlines.gaps import Crossings
 
 
 class Segments(NamedTuple):
-    """Segments of outlines; see `rts.outlines.found.Outlines`. Host arrays.
+    """Pieces of outlines, each in a dual cell, from one crossing to another. Host arrays.
 
     Attributes:
-        dual: (S, 2) int32.
-        endpoints: (S, 2) int32.
-        dual_sides: (S, 2) int32.
-        junction: (S,) int32.
-        adjacent: (S, 2) int32.
-        corner: (S, 2) float64.
-        pull: (S, 4) float64.
+        dual: (S, 2) int32, the first corner (y, x) of each segment's dual cell.
+        endpoints: (S, 2) int32, the two crossings of each segment; the near surface lies to the right of the way from
+            one to the other. −1 in second place if a crossing is alone. Segments of one dual cell follow one another.
+        dual_sides: (S, 2) int32, the sides of the dual cell that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        junction: (S,) int32, how many rows farther on there is the segment, of the same dual cell, that the outline of
+            a lone crossing ends at, or that this one crosses; 0 for none. It does so at its `corner`. Then `adjacent`
+            has the crossings of that segment, and `pull` weights of their motions, first and last, whose sum is about
+            the motion of that segment's corner. Lone crossings with no segment beside them have the first of them as
+            their junction.
+        adjacent: (S, 2) int32, the crossings along the same outline before and after these two; −1 for none.
+        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the dual cell's first
+            centre.
+        pull: (S, 4) float64, weights of the motions of the crossing before, of these two, and of the one after, whose
+            sum is the motion of the corner.
     """
 
     dual: np.ndarray

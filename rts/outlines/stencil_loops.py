@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,60 @@ BANDS, SEGMENTS = 8, 400
 own, so that results are the same for any number of threads."""
 
 
+class Beside(NamedTuple):
+    """The samples beside crossings. Host arrays, int32, −1 for none.
+
+    Attributes:
+        last: (B, 2), those that tell motions.
+        inner: (B, 2), those that tell colours, or −1 where the former do.
+        pair: (B, 2), see `Outlines.rows`.
+        stack: (B, 2, K), the stacks before and behind; K = 0 for one layer.
+    """
+
+    last: np.ndarray
+    inner: np.ndarray
+    pair: np.ndarray
+    stack: np.ndarray
+
+
+class Shown(NamedTuple):
+    """The colours beside crossings, and how these move. Host arrays.
+
+    Attributes:
+        colors: (B, 2) int32, before and behind, or −1; of several layers, composites, which follow those of all cells.
+        movers: (B, 2) int32, the samples that crossings move with, or −1: the last ones, or a pair.
+        moves: (B, 2, 3, 2), the motion of crossings along x and y, for motions (x, y, depth) of these two samples.
+        normals: (B, 2), unit normals of outlines.
+        first_stack: (B,) int32, the number of the first further stack of each; see `_further_stacks`.
+    """
+
+    colors: np.ndarray
+    movers: np.ndarray
+    moves: np.ndarray
+    normals: np.ndarray
+    first_stack: np.ndarray
+
+
+class Entries(NamedTuple):
+    """Room for entries of a stencil, in any order.
+
+    Attributes:
+        colors: (E, 3) int32, cells, colours, and the colours that these are taken of, or −1.
+        parts: (E,) their weights.
+        motions: (F, 4) int32, cells, samples, and the colours before and behind.
+        rates: (F, 3) their weights.
+    """
+
+    colors: np.ndarray
+    parts: np.ndarray
+    motions: np.ndarray
+    rates: np.ndarray
+
+
 @loop
-def _normals(gap, place, endpoints):
+def _normals(outlines):
     """Unit normals (B, 2) of outlines at crossings: the mean of their segments'; along the gap for a lone crossing."""
+    gap, place, endpoints = outlines.gap, outlines.place, outlines.segments.endpoints
     normal = np.empty((len(gap), 2))
     for b in range(len(gap)):
         normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
@@ -52,11 +103,8 @@ def _former(gap, b, i, joined):
 
 
 @compiled
-def _add_sides(
-    begin, end, place, gap, ends, rows, stack, joined, row, at_centres, shown, normal, first_stack, colors, parts,
-    motions, rates, n, m,
-):  # fmt: skip
-    """Add the entries of the surfaces on both sides of crossings with cells in lines `begin` to `end`; see `entries`.
+def _add_sides(begin, end, outlines, beside, shown, row, at_centres, entries, counts):
+    """Add the entries of the surfaces on both sides of crossings with cells in lines `begin` to `end`.
 
     From the centre to the crossing, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
@@ -66,10 +114,29 @@ def _add_sides(
 
     Of layers each moves by itself: what ends at the crossing along the normal, others along the gap.
 
+    Args:
+        begin: the first line.
+        end: the line after the last.
+        outlines: the outlines.
+        beside: the samples beside crossings.
+        shown: their colours and motions.
+        row: (K, H, W) int32, the samples in cells.
+        at_centres: (H, W) int32, the colours at centres; of several layers, composites.
+        entries: to fill.
+        counts: the numbers of entries of colours and of motions so far.
+
     Returns:
-        The numbers of entries of colours, and of motions.
+        The new numbers.
     """
-    width = at_centres.shape[1]
+    width, (n, m), (colors, parts, motions, rates) = at_centres.shape[1], counts, entries
+    gap, place, ends, joined = outlines.gap, outlines.place, outlines.ends, outlines.joined
+    rows, stack, shown_colors, normal, first_stack = (
+        beside.last,
+        beside.stack,
+        shown.colors,
+        shown.normals,
+        shown.first_stack,
+    )
     for b in range(len(gap)):
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
         if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
@@ -80,7 +147,7 @@ def _add_sides(
             at_centres.size + first_stack[b],
         )
         for i in range(2):
-            last, way = shown[b, i], 1 - 2 * i
+            last, way = shown_colors[b, i], 1 - 2 * i
             y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
             cell, here = y * width + x, at_centres[y, x]
             if not (ends[b, i] and last >= 0 and here >= 0):
@@ -201,14 +268,9 @@ def _sort_motions(n, motions, rates, order, cell, sample, weight, colors):
 
 
 @loop
-def _of_crossings(kind, slope, rows, inner, pair, stack, cells):
-    """Which samples tell the colours beside crossings, and which their motions; arguments as of `entries`.
-
-    Returns:
-        The colours (B, 2) before and behind crossings, or −1, of several layers those of composites after the ones of
-        so many `cells`; the samples (B, 2) that crossings move with, or −1: the last ones, or a pair; and the motion
-        (B, 2, 3, 2) of crossings along x and y, for motions (x, y, depth) of these two samples.
-    """
+def _of_crossings(outlines, beside, cells):
+    """`Shown.colors`, `movers` and `moves`; composites beside crossings follow those of so many `cells`."""
+    kind, slope, rows, (_, inner, pair, stack) = outlines.kind, outlines.slope, beside.last, beside
     count = len(kind)
     shown, movers, moves = np.empty((count, 2), np.int32), np.empty((count, 2), np.int32), np.zeros((count, 2, 3, 2))
     for b in range(count):
@@ -237,11 +299,13 @@ def _of_crossings(kind, slope, rows, inner, pair, stack, cells):
 
 
 @loop
-def _further_stacks(gap, ends, stack, row, shown):
-    """Stacks (R, K): two of each crossing, then those of cells in which one layer is a crossing's; see `entries`.
+def _further_stacks(outlines, stack, row, shown):
+    """Stacks (R, K): two of each crossing, then those of cells in which one layer is a crossing's.
 
-    Also returns the number (B,) of each crossing's first of the latter.
+    Also returns the number (B,) of each crossing's first of the latter. `stack` is that of `Beside`; `shown` (B, 2) are
+    the colours of `Shown`.
     """
+    gap, ends = outlines.gap, outlines.ends
     layers, count, r = len(row), len(gap), 2 * len(gap)
     stacks, first = np.empty((r * (1 + layers), layers), np.int32), np.empty(count, np.int32)
     for b in range(count):
@@ -259,77 +323,52 @@ def _further_stacks(gap, ends, stack, row, shown):
 
 
 @loop
-def _in_lines(
-    begin, end, place, gap, ends, rows, stack, dual, endpoints, dual_sides, junction, adjacent, corner, pull, joined,
-    row, at_centres, shown, movers, moves, normal, first_stack,
-):  # fmt: skip
+def _in_lines(begin, end, outlines, beside, shown, row, at_centres):
     """The entries in the cells of lines `begin` to `end`: colours as of `entries`, and motions, with their order."""
-    segments, crossings, width = 0, 0, row.shape[2]
+    segments, crossings, width, gap, dual = 0, 0, row.shape[2], outlines.gap, outlines.segments.dual
     for s in range(len(dual)):
         segments += begin - 1 <= dual[s, 0] < end
-    for b in range(len(place)):
+    for b in range(len(gap)):
         crossings += begin - 1 <= gap[b, 0] < end
     most = 20 * segments + 4 * crossings
     colors, parts = np.empty((most, 3), np.int32), np.empty(most)
     most = 64 * segments + 8 * crossings * len(row) + 1  # The last may be one of 0.
     motions, rates = np.empty((most, 4), np.int32), np.empty((most, 3))
-    n, m = add_dual_cells(
-        begin, end, place, gap, dual, endpoints, dual_sides, junction, adjacent, corner, pull, at_centres, shown,
-        movers, moves, colors, parts, motions, rates,
-    )  # fmt: skip
-    n, m = _add_sides(
-        begin, end, place, gap, ends, rows, stack, joined, row, at_centres, shown, normal, first_stack, colors, parts,
-        motions, rates, n, m,
-    )  # fmt: skip
+    room = Entries(colors, parts, motions, rates)
+    counts = add_dual_cells(begin, end, outlines, shown, at_centres, room)
+    n, m = _add_sides(begin, end, outlines, beside, shown, row, at_centres, room, counts)
     start, cells = begin * width, (end - begin) * width
     order = _by_cells(motions, m, start, cells)[1]
     return *_sorted_colors(colors, parts, n, start, cells, at_centres), motions, rates, order
 
 
-def entries(
-    place, gap, kind, slope, ends, rows, inner, pair, stack, dual, endpoints, dual_sides, junction, adjacent, corner,
-    pull, joined, row, real,
-) -> Any:  # fmt: skip
+def entries(outlines: Any, beside: Beside, row: np.ndarray, real: Any) -> Any:
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
     Args:
-        place: (B,) of outlines, as all up to `joined`.
-        gap: (B, 3).
-        kind: (B,).
-        slope: (B, 2, 2).
-        ends: (B, 2).
-        rows: (B, 2).
-        inner: (B, 2).
-        pair: (B, 2).
-        stack: (B, 2, K); K = 0 for one layer.
-        dual: (S, 2).
-        endpoints: (S, 2).
-        dual_sides: (S, 2).
-        junction: (S,).
-        adjacent: (S, 2).
-        corner: (S, 2).
-        pull: (S, 4).
-        joined: (2, H, W).
+        outlines: the `Outlines`.
+        beside: the samples beside their crossings.
         row: (K, H, W) int32, the samples in cells.
         real: the dtype of weights.
 
     Returns:
         Cells, colours and weights of colours; cells, samples, weights and colours of motions; and stacks (R, K).
     """
-    at_centres, cells, stacks, first_stack = row[0], row[0].size, np.empty((0, 0), np.int32), np.zeros_like(kind)
-    shown, movers, moves = _of_crossings(kind, slope, rows, inner, pair, stack, cells)
-    if stack.shape[2]:
+    at_centres, dual, cells = row[0], outlines.segments.dual, row[0].size
+    stacks, first_stack = np.empty((0, 0), np.int32), np.zeros_like(outlines.kind)
+    colors, movers, moves = _of_crossings(outlines, beside, cells)
+    if beside.stack.shape[2]:
         at_centres = np.where(at_centres >= 0, np.arange(cells, dtype=np.int32).reshape(at_centres.shape), np.int32(-1))
-        stacks, first_stack = _further_stacks(gap, ends, stack, row, shown)
-    of_crossings = read_only(at_centres), shown, movers, moves, _normals(gap, place, endpoints), first_stack
+        stacks, first_stack = _further_stacks(outlines, beside.stack, row, colors)
+    shown = Shown(colors, movers, moves, _normals(outlines), first_stack)
+    known = outlines, beside, shown, row, read_only(at_centres)
     bands = min(BANDS, 1 + len(dual) // SEGMENTS)
     lines = [0, *dual[len(dual) * np.arange(1, bands) // bands, 0].tolist(), row.shape[1]]
-    known = place, gap, ends, rows, stack, dual, endpoints, dual_sides, junction, adjacent, corner, pull, joined, row
     found: list[Any] = [()] * bands
 
     def some(first, last):
         for i in range(first, last):
-            found[i] = _in_lines(lines[i], lines[i + 1], *known, *of_crossings)
+            found[i] = _in_lines(lines[i], lines[i + 1], *known)
 
     parallel(some, bands, work=1500 * len(dual))
     *colors, _, _, orders = zip(*found, strict=True)
