@@ -168,7 +168,9 @@ def seen_from_above(axes: Any, place: float, inner: tuple[float, float]) -> None
     axes.text(1, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
     axes.text(place, 0.0, "crossing", ha="center", va="bottom", fontsize=8, color=INK)
     axes.annotate("", (place + 0.3, 0.6), (place + 0.05, 0.6), arrowprops={"arrowstyle": "-|>", "color": ORANGE})
-    axes.text(place + 0.07, 0.72, "the last sample:\nthe crossing moves\nas it does", va="top", fontsize=8, color=ORANGE)
+    axes.text(
+        place + 0.07, 0.72, "the last sample:\nthe crossing moves\nas it does", va="top", fontsize=8, color=ORANGE
+    )
     axes.text(-0.4, 1.62, "hollow: samples a little farther in tell the colours", va="top", fontsize=8, color=PALE)
     axes.set(xlim=(-0.5, 1.5), ylim=(1.85, -0.2))
 

@@ -56,12 +56,13 @@ def joined(crossings: Crossings, layered: bool = False) -> Segments:
         order = group.argsort(kind="stable")
         loops.turn_clockwise(order, group, along)
     known = crossings.place, crossings.tangent
-    of_crossings = *known, crossings.cells_away
-    origin, endpoints, dual_sides, neighbours = loops.segments_of(order, group, dual, ends, *of_crossings, size[1])
+    found = loops.segments_of(order, group, dual, ends, *known, crossings.cells_away, size[1])
+    origin, endpoints, dual_sides, neighbours = found
     triangle = loops.ending(crossings.kind, crossings.parts, crossings.triangles)
-    corner, pull = np.empty((len(endpoints), 2)), np.empty((len(endpoints), 4))
-    filled = origin, endpoints, dual_sides, neighbours, *known, triangle, corner, pull
-    parallel(loops.corners, len(endpoints), *filled, work=150 * len(endpoints))
-    junction = np.zeros(len(endpoints), np.int32)
-    loops.join_lone_ends(origin, endpoints, dual_sides, *known, crossings.kind, junction, corner, pull, neighbours)
-    return Segments(origin, endpoints, dual_sides, junction, np.ascontiguousarray(neighbours[:, 1:3]), corner, pull)
+    count, adjacent = len(endpoints), np.empty((len(endpoints), 2), np.int32)
+    numbers = np.zeros(count, np.int32), adjacent, np.empty((count, 2)), np.empty((count, 4))
+    segments = Segments(origin, endpoints, dual_sides, *numbers)
+    parallel(loops.corners, count, segments, neighbours, *known, triangle, work=150 * count)
+    loops.join_lone_ends(segments, neighbours, *known, crossings.kind)
+    adjacent[:] = neighbours[:, 1:3]
+    return segments

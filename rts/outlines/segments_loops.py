@@ -390,7 +390,7 @@ def _within(point, origin, s):
 
 
 @loop
-def corners(first, last, origin, endpoints, dual_sides, neighbours, place, tangent, triangle, corner, pull):
+def corners(first, last, segments, neighbours, place, tangent, triangle):
     """Fill `corner` (S, 2), from the dual cell's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
@@ -402,16 +402,13 @@ def corners(first, last, origin, endpoints, dual_sides, neighbours, place, tange
     Args:
         first: the first segment.
         last: the segment after the last.
-        origin: (S, 2), y and x of the first corner of each dual cell.
-        endpoints: (S, 2).
-        dual_sides: (S, 2), see `segments_of`.
+        segments: the segments, whose `corner` and `pull` are filled.
         neighbours: (S, 4), the result of `_neighbours`.
         place: (B, 2), x and y of crossings.
         tangent: (B, 2), see `_join`.
         triangle: (B,) int64, the triangle that ends at each crossing, or −1.
-        corner: to fill.
-        pull: to fill.
     """
+    origin, endpoints, dual_sides, _, _, corner, pull = segments
     for s in range(first, last):
         start, end = (
             _row(place, endpoints[s, 0]),
@@ -576,15 +573,16 @@ def _where_both_end(s, other, origin, endpoints, dual_sides, place, tangent):
 
 
 @loop
-def join_lone_ends(origin, endpoints, dual_sides, place, tangent, kind, junction, corner, pull, neighbours):
-    """Fill in `junction` (S,), and what else `Outlines` has of the segments with one.
+def join_lone_ends(segments, neighbours, place, tangent, kind):
+    """Fill in `junction` of segments, and change what else they have where there is one, `neighbours` (S, 4) included.
 
-    `kind` (B,) is that of `Crossings`; other arguments are as of `corners`.
+    `kind` (B,) is that of `Crossings`; `place` (B, 2) and `tangent` (B, 2) are as of `corners`.
 
     A lone crossing ends at a segment of its dual cell, since what this bounds hides the rest. The outline goes on along
     its tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone
     crossings that have no segment beside them meet in a point. Where light passes through, outlines cross.
     """
+    origin, endpoints, dual_sides, junction, _, corner, pull = segments
     count, first = len(endpoints), 0
     # Where segments end on the sides of their dual cells, see `on_sides`.
     clock, on = np.zeros((count, 2)), np.zeros(count)
