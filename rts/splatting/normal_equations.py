@@ -38,8 +38,8 @@ def normal_equations(
         image = image[..., -1:] if channels == 1 else image[..., :channels]
         return image if weights is None else image * weights[at]
 
-    entries = tuple(getattr(stencil, name) for name in _ENTRIES)
-    operands = tuple(map(read_only, (positions, rgba, row, stencil.joined, *entries)))
+    entries = [getattr(stencil, name) for name in loops.Matrix._fields[1:]]
+    operands = tuple(map(read_only, (positions, rgba, row, *entries)))
     image, _ = SPLAT.value_on_host(operands, {"border": border, "supersample": side})
     image = image.reshape(height * width, -1)
     r = compared(image, 1.0, slice(None)) - (target if weights is None else target * weights)
@@ -48,7 +48,7 @@ def normal_equations(
     cells, pixels, first = _changing(stencil, row, (height, width, side, border), even)
     changes = np.empty((len(t_positions), len(cells), rgba.shape[1]), rgba.dtype)
     t_colors = np.empty((0, 0, rgba.shape[1]), rgba.dtype) if t_rgba is None else t_rgba
-    loops.columns(cells, *operands[1:], read_only(t_positions), read_only(t_colors), changes)
+    loops.columns(cells, operands[1], loops.Matrix(*operands[2:]), read_only(t_positions), read_only(t_colors), changes)
     if side > 1 and len(first):
         changes = np.add.reduceat(changes, first, axis=1) / side**2
     jacobian = compared(changes, 0.0, pixels).reshape(len(t_positions), -1)
@@ -58,11 +58,6 @@ def normal_equations(
         w, curvatures = loss.weights(here)
         return np.asarray(value), (jacobian * curvatures) @ jacobian.T / size, jacobian @ (w * here) / size
     return np.asarray(value), jacobian @ jacobian.T / size, jacobian @ here / size
-
-
-_ENTRIES = (
-    "color_cell", "color_sample", "color_weight", "motion_cell", "motion_sample", "motion_weight", "motion_colors",
-)  # fmt: skip
 
 
 def _changing(

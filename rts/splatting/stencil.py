@@ -90,31 +90,31 @@ def _shape(
 
 
 def _forward(operands: Arrays, out: np.ndarray, border: int, supersample: int) -> None:
-    import rts.splatting.stencil_loops as loops
+    from rts.splatting import stencil_loops as loops
 
-    positions, colors, front, _, *of_colors, _, motion_sample, _, motion_colors = operands
+    positions, colors, *fields = operands
+    matrix = loops.Matrix(*fields)
     # Before loops read there.
-    check_rows(front, len(colors))
-    check_rows(of_colors[1], len(colors), "stencil.color_sample")
-    check_rows(motion_colors, len(colors), "stencil.motion_colors")
-    check_rows(motion_sample, len(positions), "stencil.motion_sample")
-    work = 2 * out.size * supersample**2
-    parallel(loops.value, len(out), border, supersample, colors, front, *of_colors, out, work=work)
+    check_rows(matrix.front, len(colors))
+    check_rows(matrix.color_sample, len(colors), "stencil.color_sample")
+    check_rows(matrix.motion_colors, len(colors), "stencil.motion_colors")
+    check_rows(matrix.motion_sample, len(positions), "stencil.motion_sample")
+    parallel(loops.value, len(out), border, supersample, colors, matrix, out, work=2 * out.size * supersample**2)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, border: int, supersample: int) -> None:
-    import rts.splatting.stencil_loops as loops
+    from rts.splatting import stencil_loops as loops
 
     t_positions, t_colors = (_or_none(t, width) for t, width in zip(tangents, (3, out.shape[2]), strict=True))
-    arrays = *operands[1:], t_positions, t_colors, out
+    arrays = operands[1], loops.Matrix(*operands[2:]), t_positions, t_colors, out
     parallel(loops.push, len(out), border, supersample, *arrays, work=4 * out.size * supersample**2)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, border: int, supersample: int) -> None:
-    import rts.splatting.stencil_loops as loops
+    from rts.splatting import stencil_loops as loops
 
     g_positions, g_colors = [np.empty((0, 3), g.dtype) if x is None else x for x in results]
-    loops.pull(border, supersample, *operands[1:], read_only(g), g_positions, g_colors)
+    loops.pull(border, supersample, operands[1], loops.Matrix(*operands[2:]), read_only(g), g_positions, g_colors)
 
 
 def _or_none(tangent: np.ndarray | None, width: int) -> np.ndarray:

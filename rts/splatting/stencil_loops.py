@@ -2,9 +2,37 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+
+
+class Matrix(NamedTuple):
+    """A stencil as the loops take it: the colour of each cell, then fields of `Stencil`. Host arrays.
+
+    Attributes:
+        front: (H, W) int32, or −1.
+        joined: (2, H, W) bool.
+        color_cell: (E,) int32.
+        color_sample: (E,) int32.
+        color_weight: (E,).
+        motion_cell: (F,) int32.
+        motion_sample: (F,) int32.
+        motion_weight: (F, 3).
+        motion_colors: (F, 2) int32.
+    """
+
+    front: np.ndarray
+    joined: np.ndarray
+    color_cell: np.ndarray
+    color_sample: np.ndarray
+    color_weight: np.ndarray
+    motion_cell: np.ndarray
+    motion_sample: np.ndarray
+    motion_weight: np.ndarray
+    motion_colors: np.ndarray
 
 
 @compiled
@@ -62,11 +90,13 @@ def _beside(front, joined, y, x):
 
 
 @loop
-def value(first, last, border, side, colors, front, color_cell, color_sample, color_weight, out):
+def value(first, last, border, side, colors, matrix, out):
     """Fill lines `first` to `last` of `out` (h, w, C); other arguments as of `rts.splatting.stencil.splat`.
 
     `side` is its `supersample`; lines and columns of cells are counted without the border.
     """
+    front, color_cell, color_sample = matrix.front, matrix.color_cell, matrix.color_sample
+    color_weight = matrix.color_weight
     width, used, share = front.shape[1], _used(color_weight), 1 / side**2
     for i in range(first * side, last * side):
         row = _pixel(i, side)
@@ -91,11 +121,11 @@ def value(first, last, border, side, colors, front, color_cell, color_sample, co
 
 
 @loop
-def push(
-    first, last, border, side, colors, front, joined, color_cell, color_sample, color_weight, motion_cell,
-    motion_sample, motion_weight, motion_colors, t_positions, t_colors, out,
-):  # fmt: skip
+def push(first, last, border, side, colors, matrix, t_positions, t_colors, out):
     """Fill lines of `out` (h, w, C) with the derivative of `value` along tangents; empty ones are zeros."""
+    front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight, motion_colors = (
+        matrix
+    )
     width, share = front.shape[1], 1 / side**2
     out[first:last] = 0.0
     first, last = first * side, last * side
@@ -145,11 +175,11 @@ def _rate(motion_weight, e, t_positions, n):
 
 
 @loop
-def pull(
-    border, side, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample,
-    motion_weight, motion_colors, g, g_positions, g_colors,
-):  # fmt: skip
+def pull(border, side, colors, matrix, g, g_positions, g_colors):
     """Add to gradients of positions and colours those of `g` (h, w, C); empty ones are not wanted."""
+    front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight, motion_colors = (
+        matrix
+    )
     width, share, lines = front.shape[1], 1 / side**2, g.shape[0] * side
     for i in range(lines):
         row = _pixel(i, side)
@@ -194,28 +224,20 @@ def pull(
 
 
 @loop
-def columns(
-    cells, colors, front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight,
-    motion_colors, t_positions, t_colors, out,
-):  # fmt: skip
+def columns(cells, colors, matrix, t_positions, t_colors, out):
     """Fill `out` (T, n, C) with the derivatives of some cells along T directions.
 
     Args:
         cells: (n,) int64, y · W + x.
-        colors: as all up to `motion_colors`, see `value`.
-        front: see there.
-        joined: see there.
-        color_cell: see there.
-        color_sample: see there.
-        color_weight: see there.
-        motion_cell: see there.
-        motion_sample: see there.
-        motion_weight: see there.
-        motion_colors: see there.
+        colors: (M, C).
+        matrix: the stencil.
         t_positions: (T, N, 3) tangents of positions.
         t_colors: (T, N, C), or (0, 0, C) for zeros.
         out: to fill.
     """
+    front, joined, color_cell, color_sample, color_weight, motion_cell, motion_sample, motion_weight, motion_colors = (
+        matrix
+    )
     width, directions, channels = front.shape[1], len(t_positions), colors.shape[1]
     used_colors, used_motions = _used(color_weight) if len(t_colors) else 0, _used(motion_weight)
     for i in range(len(cells)):
