@@ -48,8 +48,7 @@ class Beside(NamedTuple):
         most = 4 * len(crossings.gap)
         place, part, triangle = np.empty((3, most), np.int32)
         points = np.empty((most, 2))
-        of_crossings = crossings.parts, crossings.ends, crossings.points, crossings.inner, crossings.triangles
-        count = samples_loops.needed(*of_crossings, *required, place, part, triangle, points)
+        count = samples_loops.needed(crossings, required, place, part, triangle, points)
         return cls(place[:count], part[:count], triangle[:count], points[:count], np.zeros(count, np.int32), 6)
 
     def table(self, crossings: int, values: np.ndarray) -> np.ndarray:

@@ -35,33 +35,28 @@ def hits(first, last, seen, depth, owners, opaque, part, triangle, deep):
 
 
 @loop
-def needed(parts, ends, points, inner, of_crossings, colors, motions, centers, place, own, triangles, positions):
+def needed(crossings, required, place, own, triangles, positions):
     """List the samples beside crossings that tell colours and motions; returns their number.
 
     Args:
-        parts: (B, 2), as of `Crossings`.
-        ends: (B, 2).
-        points: (B, 2, 2).
-        inner: (B, 2, 2).
-        of_crossings: (B, 4), the triangles of these samples.
-        colors: see `Required`.
-        motions: likewise.
-        centers: likewise.
+        crossings: the crossings.
+        required: what samples have to tell.
         place: (4 B,) int32 to fill: places in `Outlines.rows`, of two samples that tell motions and two that tell
             colours; where nothing moves, these are in place of the former.
         own: (4 B,) int32 to fill: the parts.
         triangles: (4 B,) int32 to fill.
         positions: (4 B, 2) to fill.
     """
-    n = 0
+    parts, ends, points, inner = crossings.parts, crossings.ends, crossings.points, crossings.inner
+    (colors, motions, centers), of_crossings, n = required, crossings.triangles, 0
     for b in range(len(parts)):
         for i in range(4):
             side = i % 2
             # Of one kind alone samples stand in the first two places.
-            required = i < 2 or (colors and motions and not centers)
+            there = i < 2 or (colors and motions and not centers)
             if not motions and centers:  # What lies behind a crossing that is not the last.
-                required = i == 1 and not ends[b, 1]
-            if parts[b, side] < 0 or not required:
+                there = i == 1 and not ends[b, 1]
+            if parts[b, side] < 0 or not there:
                 continue
             at_crossing = i < 2 if motions else centers
             place[n], own[n] = 6 * b + i, parts[b, side]
