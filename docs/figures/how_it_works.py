@@ -1,6 +1,6 @@
 """The figures of docs/how-it-works.md, as SVG. Derivatives in them are the library's own.
 
-Run `python docs/figures/how_it_works.py` for all, or with names of figures for some.
+Run `PYTHONPATH=. python docs/figures/how_it_works.py` for all, or with names of figures for some.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import matplotlib
 import numpy as np
 import rts
 import torch
+from benchmarks.accuracy import area_rule
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.path import Path as Outline
-from rts.outlines import reference
 from rts.outlines.found import Outlines
 
 IMAGES = Path(__file__).parents[1] / "images/how-it-works"
@@ -166,7 +166,7 @@ def seen_from_above(axes: Any, place: float, inner: tuple[float, float]) -> None
     axes.plot(place, 0.1, "D", ms=5, mfc="white", mec=INK)
     axes.text(0, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
     axes.text(1, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
-    axes.text(place, 0.0, "crossing", ha="center", va="bottom", fontsize=8, color=INK)
+    axes.text(place + 0.06, 0.1, "crossing", va="center", fontsize=8, color=INK)
     axes.annotate("", (place + 0.3, 0.6), (place + 0.05, 0.6), arrowprops={"arrowstyle": "-|>", "color": ORANGE})
     axes.text(
         place + 0.07, 0.72, "the last sample:\nthe crossing moves\nas it does", va="top", fontsize=8, color=ORANGE
@@ -216,7 +216,7 @@ def gap() -> Figure:
 
 def inside_cell(polygon: list, corner: int, right: int, down: int) -> np.ndarray:
     """A polygon of a square, cut off at the quarter at a corner, from the upper left of that cell."""
-    low = reference.CORNERS[corner] / 2
+    low = area_rule.CORNERS[corner] / 2
     return np.clip(np.array(polygon), low, low + 0.5) + np.array([0.5 - right, 0.5 - down])
 
 
@@ -229,11 +229,11 @@ def matrix() -> Figure:
     cell = tuple((np.floor(corner).astype(int) + sampled.apron)[::-1])
     shades = ("#F2BE99", "#99C7E0")
     pixel.add_patch(Rectangle((0, 0), 1, 1, fc=shades[int(owners[row[0][cell]])], ec="none"))
-    for quarter, (right, down) in enumerate(reference.CORNERS.astype(int)):
-        rays = reference.rays_of(found, (cell[0] - down, cell[1] - right))
-        for polygon, beside in reference.regions_of(rays):
-            tie, side = rays[beside[0][0]].tie, beside[0][1]
-            shown = owners[found.rows[tie, side]] if found.rows[tie, side] >= 0 else 1
+    for quarter, (right, down) in enumerate(area_rule.CORNERS.astype(int)):
+        rays = area_rule.rays_of(found, (cell[0] - down, cell[1] - right))
+        for polygon, beside in area_rule.regions_of(rays):
+            endpoint, side = rays[beside[0][0]].endpoint, beside[0][1]
+            shown = owners[found.rows[endpoint, side]] if found.rows[endpoint, side] >= 0 else 1
             pixel.fill(*inside_cell(polygon, quarter, right, down).T, fc=shades[int(shown)], ec="none")
         for ray in rays:
             path = np.array(ray.path) + np.array([0.5 - right, 0.5 - down])
@@ -250,7 +250,9 @@ def matrix() -> Figure:
     order = sorted(weights, key=lambda sample: (owners[sample], -weights[sample]))
     for place, sample in enumerate(order):
         table.barh(place, weights[sample], color=(ORANGE, BLUE)[int(owners[sample])], height=0.7)
-        name = "centre" if sample == row[0][cell] else "centre nearby" if (row[0] == sample).any() else "beside a break"
+        name = (
+            "centre" if sample == row[0][cell] else "centre nearby" if (row[0] == sample).any() else "beside a crossing"
+        )
         table.text(weights[sample] + 0.02, place, f"{weights[sample]:.3f}   {name}", va="center", fontsize=8)
     table.set(xlim=(0, 1.15), ylim=(len(order) - 0.4, -0.6), yticks=range(len(order)))
     table.set_yticklabels([f"sample {sample}" for sample in order], fontsize=8)

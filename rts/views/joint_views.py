@@ -23,11 +23,8 @@ def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: Rend
     scene, grid, joint = joined(views, picture)
     gradient = scene.context.engine.differentiates
     check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
-    outlines, layers, required = (
-        settings.finds_outlines,
-        settings.most_layers,
-        settings.required([x.scene for x in views]),
-    )
+    outlines, layers = settings.finds_outlines, settings.most_layers
+    required = settings.required([view.scene for view in views])
     same = not required.colors and outlines and layers == 1 and not settings.fronts
     at_once = AtOnce(joint, grid, scene.opaque if outlines else [False] * len(scene.parts))
     sampled = at_once.found(at_once.centres(layers), required if outlines else None, real_of(scene), same)

@@ -10,7 +10,8 @@ from mixed_scenes import mixed_of
 from soups import soup_of
 
 import rts
-from rts.outlines import reference, stacks, stencil_loops
+from benchmarks.accuracy import area_rule
+from rts.outlines import stacks, stencil_loops
 from rts.outlines.areas_loops import BORDER
 from rts.outlines.found import FIELDS
 from rts.splatting.layers import composites
@@ -70,7 +71,7 @@ def test_areas_are_those_of_polygons(number):
     for cell in cells:
         place = divmod(int(cell), at_centres.shape[1])
         expected = np.zeros(len(whole.samples))
-        for sample, weight in reference.areas(outlines, shown, at_centres, place).items():
+        for sample, weight in area_rule.areas(outlines, shown, at_centres, place).items():
             if sample >= 0:
                 expected[owners[sample]] += weight
         np.testing.assert_allclose(parts[cell], expected, atol=2e-6, err_msg=str(place))
@@ -95,7 +96,7 @@ def test_boundary_terms_are_those_of_rays(number):
     checked = 0
     for cell in np.unique(stencil.motion_cell):
         expected, known = 0.0, True
-        for (endpoint, mover), terms in reference.boundary_terms(
+        for (endpoint, mover), terms in area_rule.boundary_terms(
             outlines, divmod(int(cell), at_centres.shape[1]), BORDER
         ).items():
             known &= not crossing[mover] and ending[mover] >= 0

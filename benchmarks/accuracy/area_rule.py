@@ -49,30 +49,23 @@ class Ray(NamedTuple):
 def rays_of(outlines: Outlines, dual: tuple[int, int]) -> list[Ray]:
     """The rays in a dual cell, whose first corner is the cell (y, x), clockwise by where they start."""
     rays = []
-    for s in np.flatnonzero((outlines.segments.dual == dual).all(axis=1)):
-        first, second = outlines.segments.endpoints[s]
-        for endpoint, side in zip(outlines.segments.endpoints[s], outlines.segments.dual_sides[s], strict=True):
+    segments = outlines.segments
+    for s in np.flatnonzero((segments.dual == dual).all(axis=1)):
+        first, second = segments.endpoints[s]
+        for endpoint, side in zip(segments.endpoints[s], segments.dual_sides[s], strict=True):
             if endpoint < 0 or first == second:
                 continue
             y, x, along = outlines.gap[endpoint] - [*dual, 0]
             start = np.clip(np.array([x, y]) + outlines.place[endpoint] * np.array([along, 1 - along]), 0.0, 1.0)
             place = (start[0], 1 + start[1], 3 - start[0], 4 - start[1])[side]
-            junction = int(s + outlines.segments.junction[s])
-            rays.append(
-                Ray(
-                    place,
-                    int(endpoint),
-                    int(side),
-                    junction,
-                    [start, outlines.segments.corner[s], outlines.segments.corner[junction]],
-                )
-            )
-    return _merged(
-        sorted(rays, key=lambda ray: (ray.side, ray.place, ray.endpoint if ray.side < 2 else -ray.endpoint)), outlines
-    )
+            junction = int(s + segments.junction[s])
+            path = [start, segments.corner[s], segments.corner[junction]]
+            rays.append(Ray(place, int(endpoint), int(side), junction, path))
+    rays.sort(key=lambda ray: (ray.side, ray.place, ray.endpoint if ray.side < 2 else -ray.endpoint))
+    return _merged(rays, segments.corner)
 
 
-def _merged(rays: list[Ray], outlines: Outlines) -> list[Ray]:
+def _merged(rays: list[Ray], corner: np.ndarray) -> list[Ray]:
     """The rays, where those of junctions that alternate around the dual cell end at one junction."""
     for i, ray in enumerate(rays):
         if ray.junction not in (before := [other.junction for other in rays[:i]]):
@@ -82,7 +75,7 @@ def _merged(rays: list[Ray], outlines: Outlines) -> list[Ray]:
             other.junction for other in [*rays[:last], *rays[i + 1 :]]
         }
         for junction in crossing - {ray.junction}:
-            end = outlines.segments.corner[ray.junction]
+            end = corner[ray.junction]
             rays = [
                 x._replace(junction=ray.junction, path=[*x.path, end]) if x.junction == junction else x for x in rays
             ]
@@ -200,17 +193,17 @@ def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> 
         cell: the cell (y, x).
         border: width, in cells, of the strip along a border of two cells in which an edge belongs to both.
     """
+    segments = outlines.segments
     found: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(2))
     for corner, (right, down) in enumerate(CORNERS.astype(int)):
         dual = cell[0] - down, cell[1] - right
-        segments = np.flatnonzero(
-            (outlines.segments.dual == dual).all(axis=1) & (np.diff(outlines.segments.endpoints)[:, 0] != 0)
-        )
-        leaders = [s + outlines.segments.junction[s] for s in segments]
-        for s in segments:
-            endpoints = [endpoint for endpoint in outlines.segments.endpoints[s] if endpoint >= 0]
-            alone = len(endpoints) == 2 and leaders.count(s + outlines.segments.junction[s]) == 1
-            signs = [1 if side < 2 else -1 for side in outlines.segments.dual_sides[s]]
+        there = (segments.dual == dual).all(axis=1) & (np.diff(segments.endpoints)[:, 0] != 0)
+        chosen = np.flatnonzero(there)
+        leaders = [s + segments.junction[s] for s in chosen]
+        for s in chosen:
+            endpoints = [endpoint for endpoint in segments.endpoints[s] if endpoint >= 0]
+            alone = len(endpoints) == 2 and leaders.count(s + segments.junction[s]) == 1
+            signs = [1 if side < 2 else -1 for side in segments.dual_sides[s]]
             for e, endpoint in enumerate(endpoints):
                 for start, end, t, motion in _pieces(outlines, int(s), e, dual):
                     sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
@@ -237,31 +230,28 @@ def _pieces(
 
     These are where it lies between crossing and corner, 0 to 1, and its motion, as weights of those of crossings.
     """
-    h = int(s + outlines.segments.junction[s])
-    first, second = (
-        outlines.segments.endpoints[s, 0],
-        outlines.segments.endpoints[s, 1]
-        if outlines.segments.endpoints[s, 1] >= 0
-        else outlines.segments.endpoints[s, 0],
-    )
-    pulling = outlines.segments.adjacent[s, 0], *outlines.segments.endpoints[s], outlines.segments.adjacent[s, 1]
+    segments = outlines.segments
+    h = int(s + segments.junction[s])
+    first, second = segments.endpoints[s]
+    second = second if second >= 0 else first
+    pulling = segments.adjacent[s, 0], *segments.endpoints[s], segments.adjacent[s, 1]
 
     def at(b: int) -> np.ndarray:
         y, x, along = outlines.gap[b] - [*dual, 0]
         return np.clip(np.array([x, y]) + outlines.place[b] * np.array([along, 1 - along]), 0.0, 1.0)
 
-    last = outlines.segments.pull[s]
+    last = segments.pull[s]
     if h == s:
         middle = along = last
     else:
         # The ray runs along the segment that it ends at from where it meets that, and moves as that does.
-        ends = [at(b if b >= 0 else outlines.segments.endpoints[h, 0]) for b in outlines.segments.endpoints[h]]
-        (t, near), (u, far) = (_nearest(end, outlines.segments.corner[h], outlines.segments.corner[s]) for end in ends)
+        ends = [at(b if b >= 0 else segments.endpoints[h, 0]) for b in segments.endpoints[h]]
+        (t, near), (u, far) = (_nearest(end, segments.corner[h], segments.corner[s]) for end in ends)
         t, own = (t, 0) if near <= far else (u, 3)
-        share, _ = _nearest(at(first), at(second), outlines.segments.corner[s])
+        share, _ = _nearest(at(first), at(second), segments.corner[s])
         middle = np.array([0, 1 - share, share, 0])
         along = t * last + (1 - t) * np.eye(4)[own]
-    points = at(outlines.segments.endpoints[s, e]), outlines.segments.corner[s], outlines.segments.corner[h]
+    points = at(segments.endpoints[s, e]), segments.corner[s], segments.corner[h]
     found = []
     for i, (before, behind) in enumerate(((np.eye(4)[1 + e], middle), (along, last))):
         way = points[i + 1] - points[i]
