@@ -122,8 +122,6 @@ class Joint:
 
     def drawn(self, size: tuple[int, int], layers: int) -> Fragments:
         """The fragments (K, H, W) at the centres of cells, whose triangles are counted over the parts."""
-        from rts.sampling import merging_loops
-
         passes, shape = [], (layers, *size)
         for sampler, prepared, camera, cull, triangles in self.draws:
             count = len(self.proxy.faces) if triangles is None else len(triangles)
@@ -135,6 +133,8 @@ class Joint:
             passes.append(Fragments(ids, shares, depth))
         if len(passes) == 1:
             return passes[0]
+        from rts.sampling import merging_loops
+
         merged = Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
         for fragments in passes:
             parallel(merging_loops.insert_fragments, size[0], *fragments, *merged, work=5 * merged.depth.size)
