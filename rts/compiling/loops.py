@@ -8,8 +8,9 @@ be most of the time. A helper that is called for each item counts none if it tak
 `break`, and uses all of them to its end. Views (`a[i]`, `a[b:e]`) and tuples of arrays are counted wherever they are
 made; whole arrays with indices, numbers, and tuples of numbers are not. A helper with `inline="always"` becomes a part
 of the loop: a tenth of the time of loops over outlines. Large ones take longer to compile. It counts none either, but
-where it writes to an array in a branch alone, returns early, or takes an item of a tuple by a number known only at run
-time, as a loop over a tuple does.
+where it writes to an array in a branch alone, returns early, leaves a loop by `break`, or takes an item of a tuple by a
+number known only at run time, as a loop over a tuple does. To choose one of two arrays (`a if x else b`), or to pass
+arguments on as `*tuple`, is counted; to choose between their items is not.
 """
 
 from __future__ import annotations

@@ -55,32 +55,28 @@ def _rest(spans, begin, stop, place):
 @compiled(inline="always")
 def _nearest(spans, begin, stop, place, beyond):
     """The nearest of a gap's spans, `begin` to `stop`, that covers `place`, and goes on after it; −1 for none."""
-    best = NOTHING
-    for i in range(begin, stop):
-        if spans[i, 0] > place + beyond:
-            break
+    best, z, i = NOTHING, np.inf, begin
+    while i < stop and spans[i, 0] <= place + beyond:
         if spans[i, 1] > place + beyond:
-            if best < 0 or depth_at(spans, i, place) < depth_at(spans, best, place):
-                best = i
+            deep = depth_at(spans, i, place)
+            best, z = (i, deep) if best < 0 or deep < z else (best, z)
+        i += 1
     return best
 
 
 @compiled(inline="always")
 def _next_start(spans, begin, stop, place):
     """The least start of a span of a gap at or after a place; infinite if there is none."""
-    for i in range(begin, stop):
-        if spans[i, 1] > place + TOUCH:
-            return max(spans[i, 0], place)
-    return np.inf
+    i = _rest(spans, begin, stop, place + TOUCH)
+    return max(spans[i, 0], place) if i < stop else np.inf
 
 
 @compiled(inline="always")
 def _overtaken(spans, begin, stop, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
-    best, by = spans[x, 1], -9
-    for i in range(begin, stop):
-        if spans[i, 0] >= spans[x, 1]:
-            break
+    best, by, i = spans[x, 1], -9, begin - 1
+    while i + 1 < stop and spans[i + 1, 0] <= best + TINY:
+        i += 1
         low, high = max(place, spans[i, 0]), min(spans[x, 1], spans[i, 1])
         if i == x or high - low <= TINY:
             continue
@@ -171,13 +167,12 @@ def _agree(spans, begin, stop, seen, depth, centre):
 @compiled(inline="always")
 def _goes_on(spans, begin, stop, parts, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
-    found, z = False, depth_at(spans, x, place)
-    for i in range(begin, stop):
-        if spans[i, 0] > place + TOUCH:
-            break
+    found, z, i = False, depth_at(spans, x, place), begin
+    while i < stop and spans[i, 0] <= place + TOUCH:
         touches = abs(spans[i, 1 - way] - place) <= TOUCH and spans[i, 1] > spans[i, 0]
         if touches and i != x and parts[i] == parts[x]:
             found |= abs(depth_at(spans, i, place) - z) <= ALIKE * abs(z)
+        i += 1
     return found
 
 
@@ -354,7 +349,8 @@ def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
 @compiled(inline="always")
 def _part(g, parts, ends, x):
     """The part of a piece of front of a gap."""
-    return parts[x] if x >= 0 else (ends[g, 0, 0] if x == FIRST else (ends[g, 1, 0] if x == SECOND else np.int32(-1)))
+    end = ends[g, 1 if x == SECOND else 0, 0]
+    return parts[x] if x >= 0 else (end if x != NOTHING else np.int32(-1))
 
 
 @compiled(inline="always")

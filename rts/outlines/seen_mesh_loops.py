@@ -13,6 +13,9 @@ from rts.sampling.points_loops import corners_of, edge, weights_at
 STEPS = 4096
 """The most triangles of one walk."""
 
+WALKS = -2
+"""In place of the triangle that a walk ends on, as long as it goes on."""
+
 
 @compiled(inline="always")
 def plane_at(corners, sign, x, y):
@@ -89,51 +92,48 @@ def _walked(t, target, start, axis, at, seen, faces, adjacent):
         faces: (T, 3).
         adjacent: (T, 3).
     """
-    out, place, first, second = -1, -np.inf, faces[t, 1], faces[t, 2]
+    out, place, first, second, end, steps = -1, -np.inf, faces[t, 1], faces[t, 2], np.int32(WALKS), 0
     # The edge that the line goes out through, opposite the corner `out`.
     for c in range(3):
         a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
         ay, by = seen[a, 1 - axis] - at, seen[b, 1 - axis] - at
-        if np.isnan(ay):
-            return np.int32(-1)
+        end = end if not np.isnan(ay) else np.int32(-1)
         if (ay >= 0) != (by >= 0):
             there = _meets(seen[a, axis], ay, seen[b, axis], by)
             if there > place:
                 out, place, first, second = c, there, a, b
-    if out < 0:
-        return np.int32(-1)
+    end = end if out >= 0 else np.int32(-1)
     # Its ends, of which each step replaces one. The steps hardly branch: no processor could tell which way they go.
     ax, ay, bx, by = seen[first, axis], seen[first, 1 - axis] - at, seen[second, axis], seen[second, 1 - axis] - at
-    for _ in range(STEPS):
+    while end == WALKS and steps < STEPS:
+        s, steps = adjacent[t, out], steps + 1
         if place >= start + 1:
-            return t
-        s = adjacent[t, out]
-        if s < 0 or s == target:
-            return s
-        third = faces[s, 0] ^ faces[s, 1] ^ faces[s, 2] ^ first ^ second
-        cx, cy = seen[third, axis], seen[third, 1 - axis] - at
-        if np.isnan(cy):
-            return np.int32(-1)
-        # The vertex on the other side of the line than the third one stays.
-        stays = (ay >= 0) != (cy >= 0)
-        left = second if stays else first
-        first, ax, ay = (first, ax, ay) if stays else (third, cx, cy)
-        second, bx, by = (third, cx, cy) if stays else (second, bx, by)
-        before, place = place, _meets(ax, ay, bx, by)
-        if place < before:
-            return np.int32(-1)  # The triangle lies on the same side of the edge: the patch turns away.
-        t, out = s, 1 if faces[s, 1] == left else (2 if faces[s, 2] == left else 0)
-    return np.int32(-1)
+            end = t
+        elif s < 0 or s == target:
+            end = s
+        else:
+            third = faces[s, 0] ^ faces[s, 1] ^ faces[s, 2] ^ first ^ second
+            cx, cy = seen[third, axis], seen[third, 1 - axis] - at
+            # The vertex on the other side of the line than the third one stays.
+            stays = (ay >= 0) != (cy >= 0)
+            left = second if stays else first
+            first, ax, ay = (first, ax, ay) if stays else (third, cx, cy)
+            second, bx, by = (third, cx, cy) if stays else (second, bx, by)
+            before, place = place, _meets(ax, ay, bx, by)
+            # Where the triangle lies on the same side of the edge, the patch turns away.
+            end = np.int32(-1 if np.isnan(cy) or place < before else WALKS)
+            t, out = s, 1 if faces[s, 1] == left else (2 if faces[s, 2] == left else 0)
+    return end if end != WALKS else np.int32(-1)
 
 
 @compiled(inline="always")
 def _touch(faces, t, s):
     """True if two triangles have a corner in common."""
+    found = False
     for i in range(3):
         for j in range(3):
-            if faces[t, i] == faces[s, j]:
-                return True
-    return False
+            found |= faces[t, i] == faces[s, j]
+    return found
 
 
 @loop
@@ -205,17 +205,18 @@ def on_planes(first, last, triangles, points, rows, vertices, faces, weights, de
 @compiled(inline="always")
 def on_edges(corners, x, y):
     """Depth and first two barycentrics of the point of a triangle's edges that is seen nearest to a position."""
-    least, z, shares, best = np.inf, 0.0, np.zeros(3), np.zeros(3)
+    least, shares = np.inf, (0.0, 0.0, 0.0)
     for k in range(3):
-        a, b = corners[(k + 1) % 3], corners[(k + 2) % 3]
-        ax, ay, dx, dy = a[0] / a[2], a[1] / a[2], b[0] / b[2] - a[0] / a[2], b[1] / b[2] - a[1] / a[2]
+        i, j = (k + 1) % 3, (k + 2) % 3
+        aw, bw = corners[i, 2], corners[j, 2]
+        ax, ay = corners[i, 0] / aw, corners[i, 1] / aw
+        dx, dy = corners[j, 0] / bw - ax, corners[j, 1] / bw - ay
         length = dx * dx + dy * dy
         t = min(max(((x - ax) * dx + (y - ay) * dy) / length, 0.0), 1.0) if length > 0 else 0.0
         off = (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
         if off < least:
-            total = (1 - t) / a[2] + t / b[2]
-            shares[k], shares[(k + 1) % 3], shares[(k + 2) % 3] = 0.0, (1 - t) / a[2] / total, t / b[2] / total
-            least, best[:] = off, shares
-    for k in range(3):
-        z += best[k] * corners[k, 3]
-    return z, best[0], best[1]
+            total = (1 - t) / aw + t / bw
+            p, q = (1 - t) / aw / total, t / bw / total
+            least, shares = off, (0.0, p, q) if k == 0 else ((q, 0.0, p) if k == 1 else (p, q, 0.0))
+    z = shares[0] * corners[0, 3] + shares[1] * corners[1, 3] + shares[2] * corners[2, 3]
+    return z, shares[0], shares[1]

@@ -112,12 +112,11 @@ def _passes_centres(a, b, seen):
 @compiled(inline="always")
 def _in_image(a, b, seen, size):
     """False for an edge that lies beyond one border of the image."""
+    beyond = False
     for axis in range(2):
-        if seen[a, axis] < 0 and seen[b, axis] < 0:
-            return False
-        if seen[a, axis] > size[1 - axis] and seen[b, axis] > size[1 - axis]:
-            return False
-    return True
+        beyond |= (seen[a, axis] < 0) & (seen[b, axis] < 0)
+        beyond |= (seen[a, axis] > size[1 - axis]) & (seen[b, axis] > size[1 - axis])
+    return not beyond
 
 
 @compiled(inline="always")
@@ -131,17 +130,12 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
         ends[k, 0], ends[k, 1], deep[k] = seen[v, 0], seen[v, 1], rows[3, 3]
         for r in range(3):
             deep[k] += rows[3, r] * vertices[v, r]
-    if not np.isnan(ends[0, 0] + ends[1, 0]):
-        return True
-    values = near_plane[3], near_plane[3]
-    first, second = values
+    shown, (first, second) = True, (near_plane[3], near_plane[3])
     for r in range(3):
         first += near_plane[r] * vertices[a, r]
         second += near_plane[r] * vertices[b, r]
-    if first <= 0 and second <= 0:
-        return False
     cut = first / (first - second) if (first > 0) != (second > 0) else 0.0
-    for k in range(2):
+    for k in range(2 if np.isnan(ends[0, 0] + ends[1, 0]) else 0):
         value, share = (first, 0.0) if k == 0 else (second, 1.0)
         share = share if value > 0 else cut
         x, y, w, deep[k] = rows[0, 3], rows[1, 3], rows[2, 3], rows[3, 3]
@@ -149,10 +143,9 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
             place = (1 - share) * vertices[a, r] + share * vertices[b, r]
             x, y, w = x + rows[0, r] * place, y + rows[1, r] * place, w + rows[2, r] * place
             deep[k] += rows[3, r] * place
-        if not w > 0:
-            return False
         ends[k, 0], ends[k, 1] = x / w, y / w
-    return True
+        shown &= w > 0 and not (first <= 0 and second <= 0)
+    return shown
 
 
 @compiled(inline="always")

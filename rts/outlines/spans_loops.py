@@ -133,9 +133,9 @@ def close(first, last, seen, cells, marks):
 
 
 @compiled(inline="always")
-def _gaps_of(box, axis, by_row, by_column):
+def _gaps_of(box, axis, height, width):
     """The lines of centres that a box meets, then the gaps of each: the first and the one after the last."""
-    lines, count = by_row.shape if axis == 0 else by_column.shape
+    lines, count = (height, width) if axis == 0 else (width, height)
     begin, stop = _range(box[2 - 2 * axis] - 0.5, box[3 - 2 * axis] - 0.5, lines)
     # A gap reaches from its first centre to the next one.
     low, high = _range(box[2 * axis] - 1.5, box[2 * axis + 1] - 0.5, count - 1)
@@ -158,7 +158,7 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         by_column: see `Gaps`.
         most: to fill.
     """
-    box = np.empty(4, np.float32)
+    box, (height, width) = np.empty(4, np.float32), by_row.shape
     for t in range(first, last):
         most[t] = 0
         size = abs(sides[t])
@@ -169,11 +169,11 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         axes = (close[a] & close[b] & close[c]) >> 2 * (min(size, 4) - 1) & 3 if size < ANYWHERE else 3
         if axes == 0:
             continue
-        _box(a, b, c, seen, len(by_row), len(by_column), box)
+        _box(a, b, c, seen, height, width, box)
         for axis in range(2):
             if axes & (1 + axis) == 0:
                 continue
-            begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
+            begin, stop, low, high = _gaps_of(box, axis, height, width)
             table = by_row if axis == 0 else by_column
             for n in range(begin, stop):
                 most[t] += table[n, high] - table[n, low]
@@ -221,26 +221,29 @@ def spans_of(
         spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d. Or (N, 9), with the triangle's unit normal
             on the side that is seen, in the proxy's space, where it starts or ends at such an edge.
     """
-    corners, box, line = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2))
-    seams = spans.shape[1] > 6
+    corners, box, line, edges = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2)), np.empty((3, 3))
+    (height, width), seams = by_row.shape, spans.shape[1] > 6
     for i in range(first, last):
         t, count = triangles[i], begins[i]
         sign = corners_of(t, rows, vertices, faces, corners)
         if not abs(sign) > 0 or sign * keep[t] < 0:  # NaN, too.
             continue
-        size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
+        size = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, height, width, box)
         large = 0 if abs(size) < 2 * LARGE else 4  # Those that are seen in part, too.
         normal = _normal(t, sign, vertices, faces) if seams else (0.0, 0.0, 0.0)
         cut = _cut(t, clip, vertices, faces)
+        for k in range(3):
+            edges[k, 0], edges[k, 1], edges[k, 2] = edge(corners, k, sign)
         for axis in range(2):
-            begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
-            table = by_row if axis == 0 else by_column
+            begin, stop, low, high = _gaps_of(box, axis, height, width)
             for n in range(begin, stop):
-                if table[n, low] == table[n, high]:
+                # To choose between the arrays themselves would count their references.
+                ends = (by_row[n, low], by_row[n, high]) if axis == 0 else (by_column[n, low], by_column[n, high])
+                if ends[0] == ends[1]:
                     continue
-                _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
-                least, most, start, end = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
-                on_line = table[n, low], table[n, high], 1 - axis
+                _on_line(t, edges, clip, cut, vertices, faces, axis, n + 0.5, line)
+                least, most, start, end = _inside(line, cut, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
+                on_line = *ends, 1 - axis
                 bounds = least, most, seams * (_is_open(adjacent, t, start) + 2 * _is_open(adjacent, t, end) + large)
                 count = _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count)
 
@@ -299,14 +302,14 @@ def _cut(t, clip, vertices, faces):
 
 
 @compiled(inline="always")
-def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
+def _on_line(t, edges, clip, cut, vertices, faces, along, at, line):
     """Fill `line` with functions c + d · x that are positive on what is seen of a triangle along a line of centres.
 
     Rows 0 to 2 are the edge functions, 3 and 4 the near and the far plane, if these may cut the triangle.
     """
     line[3:] = 0.0
     for k in range(3):
-        ex, ey, e = edge(corners, k, sign)
+        ex, ey, e = edges[k, 0], edges[k, 1], edges[k, 2]
         line[k, 0], line[k, 1] = (ey * at + e, ex) if along == 0 else (ex * at + e, ey)
         if not cut:
             continue
@@ -320,10 +323,10 @@ def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
 
 
 @compiled(inline="always")
-def _inside(line, low, high):
+def _inside(line, cut, low, high):
     """The interval, within one that is given, where all functions of a line are positive; and those that bound it."""
     start, end = -1, -1
-    for k in range(5):
+    for k in range(5 if cut else 3):
         c, d = line[k, 0], line[k, 1]
         if d > 0:
             at = -c / d

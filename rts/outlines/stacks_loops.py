@@ -229,11 +229,13 @@ def _index(stack, count, i):
 
 
 @compiled
-def _record(base, f, kind, at, partner, place, stack, count, own, of, enders, whole, place_of, samples, places, sides):
+def _record(change, stack, count, own, of, enders, whole, place_of, samples, places, sides):
     """Fill in change f of the stack along a gap, but for the samples of what ends there; see `changes`.
 
-    `enders[f]` are filled with the runs that change, the second one −1 for none.
+    `enders[f]` are filled with the runs that change, the second one −1 for none. `change` holds no constants: for
+    each of them the helper would be compiled again.
     """
+    base, f, kind, at, partner, place = change
     e, most, entries, second = base + f, sides.shape[2], samples.shape[1] - 2, at + 1 if kind == INTERSECT else partner
     enders[f, 0], enders[f, 1] = stack[at], stack[second] if second >= 0 else -1
     whole[e, 1], place_of[e] = kind, place
@@ -363,8 +365,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             place = max(place, there)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, INTERSECT, m, -1, place
-                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
+                    change = base, found, np.int64(INTERSECT), m, np.int64(-1), place
+                    _record(change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             stack[m], stack[m + 1] = stack[m + 1], stack[m]
         place = knots[k]
@@ -377,8 +379,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
             m, partner = (partner, m) if 0 <= partner < m else (m, partner)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, BEFORE_ENDS, m, partner, place
-                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
+                    change = base, found, np.int64(BEFORE_ENDS), m, partner, place
+                    _record(change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             for x in (partner, m):
                 if x >= 0:
@@ -398,8 +400,8 @@ def _found_along(numbers, own, of, stack, knots, enders, whole, place_of, sample
                 m, partner = (m, partner) if partner > m else (partner, m + 1)
             if _seen(stack, m, most, of):
                 if found < room:
-                    change = base, found, BEHIND_ENDS, m, partner, place
-                    _record(*change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
+                    change = base, found, np.int64(BEHIND_ENDS), m, partner, place
+                    _record(change, stack, count, own, of, enders, whole, place_of, samples, places, sides)
                 found += 1
             i = _next_starting(n, own, of, place, farther)
     return found

@@ -15,7 +15,8 @@ from rts_backends.triangles import owns
 BAND_ROWS = 16
 """Rows of pixels that a thread draws at a time."""
 
-BLOCK = 64
+BLOCK = 256
+"""Triangles of a block. For each block references to arrays are counted: larger ones hardly take less time."""
 
 WIDE = 12
 """Columns of a triangle from which on its rows are drawn whole, where one layer is kept: below, collected hits cost
