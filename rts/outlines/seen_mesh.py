@@ -44,11 +44,6 @@ class SeenMesh(NamedTuple):
     seen: np.ndarray
     sides: np.ndarray
 
-    @property
-    def parts(self) -> range:
-        """The indices of the parts."""
-        return range(self.first, self.first + len(self.starts) - 1)
-
     @classmethod
     def of(
         cls,
@@ -91,9 +86,10 @@ class SeenMesh(NamedTuple):
         starts = np.array([0, *itertools.accumulate(map(len, tables))], np.int32)
         adjacent = [_adjacent(table) for table in tables]
         adjacent = adjacent[0] if len(adjacent) == 1 else in_one(adjacent, starts[:-1].tolist())
-        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=5 * len(faces))
         keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
-        return cls(first, starts, vertices, faces, adjacent, rows, near_and_far(camera), keep, seen, sides)
+        mesh = cls(first, starts, vertices, faces, adjacent, rows, near_and_far(camera), keep, seen, sides)
+        parallel(silhouettes_loops.turns, len(faces), mesh, work=5 * len(faces))
+        return mesh
 
     def mark_silhouettes(self, hits: Hits, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a patch may end or turn away; see the loop of this name.
@@ -102,19 +98,8 @@ class SeenMesh(NamedTuple):
         """
         from rts.outlines import silhouettes_loops
 
-        mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
-        seen_by = self.clip[0], self.keep, self.seen, self.adjacent, self.sides
-        parallel(
-            silhouettes_loops.mark_silhouettes,
-            count,
-            *mesh,
-            *seen_by,
-            hits.part,
-            hits.depth,
-            width,
-            met,
-            work=10 * count,
-        )
+        count, mark = len(self.faces), silhouettes_loops.mark_silhouettes
+        parallel(mark, count, self, hits.part, hits.depth, width, met, work=10 * count)
 
     def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
@@ -123,10 +108,8 @@ class SeenMesh(NamedTuple):
         """
         from rts.outlines import seen_mesh_loops
 
-        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.adjacent), len(joined[0])
-        part_range = np.int32(self.parts.start), np.int32(self.parts.stop)
-        arguments = *map(read_only, hits), part_range, *mesh, self.keep, met, joined
-        parallel(seen_mesh_loops.seams, height, *arguments, work=8 * joined[0].size)
+        arguments = *map(read_only, hits), self, met, joined
+        parallel(seen_mesh_loops.seams, len(joined[0]), *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
@@ -135,16 +118,14 @@ class SeenMesh(NamedTuple):
         close = np.empty(len(self.seen), np.int8)
         parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
-        of_triangles = self.faces, self.seen, self.sides, self.keep, close
-        parallel(spans_loops.most_spans, count, *of_triangles, gaps.rows, gaps.columns, most, work=40 * count)
+        parallel(spans_loops.most_spans, count, self, close, gaps, most, work=40 * count)
         (triangles,) = most.nonzero()
         most = most[triangles]
         ends = most.cumsum()
         begins, total = ends - most, int(ends[-1]) if len(ends) else 0
         names, spans = np.empty((total, 3), np.int32), np.empty((total, 9 if seams else 6))
         names[:, 0] = -1
-        mesh = self.rows, self.vertices, self.faces, self.adjacent, self.clip, self.keep, self.seen
-        arguments = triangles, begins, *mesh, *gaps[:3], names, spans
+        arguments = triangles, begins, self, gaps, names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
         part = self.starts[1:-1].searchsorted(names[:, 1], "right") + self.first
         return names, spans, part.astype(np.int32)
@@ -159,22 +140,15 @@ class SeenMesh(NamedTuple):
         parallel(seen_mesh_loops.on_planes, count, *arguments, work=50 * count)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None])
 
-    def edges(
-        self,
-        near: np.ndarray,
-        parts: np.ndarray,
-        triangles: np.ndarray,
-        points: np.ndarray,
-        slope: np.ndarray,
-        depth: np.ndarray,
-        tangent: np.ndarray,
-    ) -> None:
-        """Fill in what the triangles tell of the edges at crossings; see `silhouettes_loops.edges`."""
+    def edges(self, kind: np.ndarray, *arrays: np.ndarray) -> None:
+        """Fill in what the triangles tell of the edges at crossings; see `silhouettes_loops.edges`.
+
+        `arrays` are the parts, triangles and points of crossings, then slopes, depths and tangents, which are filled.
+        """
         from rts.outlines import silhouettes_loops
 
-        own, mesh = (np.int32(self.parts.start), np.int32(self.parts.stop)), (self.rows, self.vertices, self.faces)
-        arguments = near, parts, triangles, points, own, *mesh, slope, depth, tangent
-        parallel(silhouettes_loops.edges, len(near), *arguments, work=100 * len(near))
+        arguments = kind, *arrays[:3], self, *arrays[3:]
+        parallel(silhouettes_loops.edges, len(kind), *arguments, work=100 * len(kind))
 
 
 _welds: dict[int, tuple[weakref.ref, np.ndarray, np.ndarray]] = {}

@@ -137,7 +137,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, adjacent, keep, met, joined):
+def seams(first, last, part, triangle, depth, mesh, met, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose first hits are joined by a patch of triangles.
 
     Args:
@@ -146,17 +146,13 @@ def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, 
         part: (H, W) int32, the parts seen at centres; or (K H, W), those of layers.
         triangle: likewise, their triangles.
         depth: likewise, float64.
-        part_range: the first part that the further arguments belong to, and the one after the last.
-        seen: (V, 2), see `projected`.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3) of the proxy.
-        adjacent: (T, 3), the result of `neighbours`.
-        keep: (T,), see `spans_loops.spans_of`: where one side of triangles is seen, two that share an edge do not fold.
-        met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.meet`.
+        mesh: the triangles of some parts, a `SeenMesh`.
+        met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.mark_silhouettes`.
         joined: (2, H, W) or (2, K H, W) bool to fill: along x, and along y.
     """
-    (_, height, width), corners = met.shape, np.empty((3, 4))
+    (_, height, width), corners, keep = met.shape, np.empty((3, 4)), mesh.keep
+    seen, rows, vertices, faces, adjacent = mesh.seen, mesh.rows, mesh.vertices, mesh.faces, mesh.adjacent
+    part_range = mesh.first, mesh.first + len(mesh.starts) - 1
     apart = np.empty(width, np.bool_)
     for y in range(first, last):
         for axis in range(2):

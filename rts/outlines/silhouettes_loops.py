@@ -18,20 +18,17 @@ n − 0.52 cells wide and high: where they meet a gap, their vertices are at mos
 
 
 @loop
-def turns(first, last, rows, vertices, faces, seen, sides):
-    """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
+def turns(first, last, mesh):
+    """Fill the `sides` of a `SeenMesh`: which side of a triangle is seen, by the sign of its determinant.
 
     They are multiplied by the triangle's size; see `LARGE`.
 
     Args:
         first: the first triangle.
         last: the triangle after the last.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3) of the proxy.
-        seen: (V, 2), see `seen_mesh_loops.projected`.
-        sides: (T,) to fill.
+        mesh: the triangles.
     """
+    rows, vertices, faces, seen, sides = mesh.rows, mesh.vertices, mesh.faces, mesh.seen, mesh.sides
     corners = np.empty((3, 4))
     for t in range(first, last):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -53,37 +50,28 @@ def _extent(a, b, c, seen, axis):
 
 
 @loop
-def mark_silhouettes(
-    first, last, rows, vertices, faces, near_plane, keep, seen, adjacent, sides, part, depth, width, gaps
-):
+def mark_silhouettes(first, last, mesh, part, depth, width, gaps):
     """Mark, in `gaps` (2, H, W), those that silhouettes meet: 2, or 1 where both centres show something nearer.
 
     Args:
         first: the first triangle.
         last: the triangle after the last.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3) of the proxy.
-        near_plane: (4,), positive on what is seen.
-        keep: (T,), see `spans_loops.spans_of`.
-        seen: (V, 2), see `seen_mesh_loops.projected`.
-        adjacent: (T, 3), see `seen_mesh_loops.neighbours`.
-        sides: (T + 1,), see `turns`; the last is 0, of the triangle −1, which is none.
+        mesh: the triangles, a `SeenMesh`.
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         gaps: (2, H, W) uint8.
     """
+    rows, vertices, faces, near_plane, seen = mesh.rows, mesh.vertices, mesh.faces, mesh.clip[0], mesh.seen
+    keep, adjacent, sides = mesh.keep, mesh.adjacent, mesh.sides
     ends, deep = np.empty((2, 2)), np.empty(2)
     for t in range(first, last):
         side = sides[t]
         if side == 0 or side * keep[t] < 0:
             continue
         # In most triangles all three neighbours go on: one branch.
-        on = (
-            (sides[adjacent[t, 0]] * side > 0) & (sides[adjacent[t, 1]] * side > 0) & (sides[adjacent[t, 2]] * side > 0)
-        )
-        if on:
+        a, b, c = sides[adjacent[t, 0]], sides[adjacent[t, 1]], sides[adjacent[t, 2]]
+        if (a * side > 0) & (b * side > 0) & (c * side > 0):
             continue
         for c in range(3):
             s = adjacent[t, c]
@@ -175,7 +163,7 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
 
 
 @loop
-def edges(first, last, kind, parts, triangles, points, own, rows, vertices, faces, slope, depth, tangent):
+def edges(first, last, kind, parts, triangles, points, mesh, slope, depth, tangent):
     """What the triangles of some parts tell of crossings.
 
     Args:
@@ -185,15 +173,13 @@ def edges(first, last, kind, parts, triangles, points, own, rows, vertices, face
         parts: (B, 2), the parts before and behind.
         triangles: (B, 2 or more), alike.
         points: (B, 2), where crossings are.
-        own: the first of the parts, and the one after the last.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3) of the proxy.
+        mesh: the triangles of these parts, a `SeenMesh`.
         slope: (B, 2, 2) to fill where surfaces intersect: slopes of depth along x and y, a cell.
         depth: (B,) to fill: of the surface that ends, or where surfaces intersect.
         tangent: (B, 2) to fill: along the nearest edge of the triangle that ends, or of the one before.
     """
-    corners = np.empty((3, 4))
+    rows, vertices, faces, corners = mesh.rows, mesh.vertices, mesh.faces, np.empty((3, 4))
+    own = mesh.first, mesh.first + len(mesh.starts) - 1
     for b in range(first, last):
         x, y = points[b, 0], points[b, 1]
         for side in range(2):

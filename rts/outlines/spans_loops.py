@@ -143,21 +143,18 @@ def _gaps_of(box, axis, height, width):
 
 
 @loop
-def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, most):
+def most_spans(first, last, mesh, close, gaps, most):
     """Fill `most` (T,) int32 with bounds on the numbers of spans of triangles.
 
     Args:
         first: the first triangle.
         last: the triangle after the last.
-        faces: see `spans_of`.
-        seen: see `spans_of`.
-        sides: (T + 1,) int8, see `silhouettes_loops.turns`.
-        keep: see `spans_of`.
+        mesh: the triangles, a `SeenMesh`.
         close: (V,), see the loop of this name, of cells `around` gaps.
-        by_row: see `Gaps`.
-        by_column: see `Gaps`.
+        gaps: the gaps.
         most: to fill.
     """
+    faces, seen, sides, keep, (_, by_row, by_column, _) = mesh.faces, mesh.seen, mesh.sides, mesh.keep, gaps
     box, (height, width) = np.empty(4, np.float32), by_row.shape
     for t in range(first, last):
         most[t] = 0
@@ -180,24 +177,7 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
 
 
 @loop
-def spans_of(
-    first,
-    last,
-    triangles,
-    begins,
-    rows,
-    vertices,
-    faces,
-    adjacent,
-    clip,
-    keep,
-    seen,
-    gap,
-    by_row,
-    by_column,
-    names,
-    spans,
-):
+def spans_of(first, last, triangles, begins, mesh, gaps, names, spans):
     """Spans of triangles on gaps.
 
     Args:
@@ -205,22 +185,17 @@ def spans_of(
         last: the triangle after the last.
         triangles: (M,) the triangles.
         begins: (M,) where the spans of each begin.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3) of the proxy.
-        adjacent: (T, 3), see `seen_mesh_loops.neighbours`.
-        clip: (2, 4) near and far plane, positive on what is seen.
-        keep: (T,) int8, the sign of the determinants of triangles that are kept; 0 keeps both.
-        seen: (V, 2), see `seen_mesh_loops.projected`.
-        gap: see `Gaps`.
-        by_row: see `Gaps`.
-        by_column: see `Gaps`.
+        mesh: the triangles of which these are, a `SeenMesh`.
+        gaps: the gaps.
         names: (N, 3) int32 to fill, of each span the gap, the triangle, and a sum: 1 if it starts at an edge that no
             other triangle shares, 2 if it ends at one, 4 if the triangle is `LARGE`; or 0 if `spans` have no normals.
             The gaps of those that are left out stay as they are, −1.
         spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d. Or (N, 9), with the triangle's unit normal
             on the side that is seen, in the proxy's space, where it starts or ends at such an edge.
     """
+    rows, vertices, faces, adjacent = mesh.rows, mesh.vertices, mesh.faces, mesh.adjacent
+    clip, keep, seen = mesh.clip, mesh.keep, mesh.seen
+    gap, by_row, by_column = gaps.gap, gaps.rows, gaps.columns
     corners, box, line, edges = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2)), np.empty((3, 3))
     (height, width), seams = by_row.shape, spans.shape[1] > 6
     for i in range(first, last):
