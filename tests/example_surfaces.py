@@ -115,7 +115,7 @@ def points_at(points, ids, params):
     return tuple(np.einsum("ni,nic->nc", products(*w), corners) for w in ((a, b), (da, b), (a, db)))
 
 
-class SeenMesh(rts.TriangleSurface):
+class Sheets(rts.TriangleSurface):
     """Squares that face +z, at the heights θ["heights"] (L,); a sample is the number of its sheet, and x and y."""
 
     sample_widths = (1, 2)
@@ -149,7 +149,7 @@ class SeenMesh(rts.TriangleSurface):
         return rts.GBuffer(position=xp.stack([xp.astype(xy[:, 0], z.dtype), xp.astype(xy[:, 1], z.dtype), z], axis=-1))
 
 
-class Crowded(SeenMesh):
+class Crowded(Sheets):
     """Sheets whose samples find x, y and their sheet in a table that has room for some: a sample is its entry."""
 
     sample_widths = (1, 0)

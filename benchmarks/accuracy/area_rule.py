@@ -71,10 +71,10 @@ def _merged(rays: list[Ray], corner: np.ndarray) -> list[Ray]:
         if ray.junction not in (before := [other.junction for other in rays[:i]]):
             continue
         last = i - 1 - before[::-1].index(ray.junction)
-        crossing = {other.junction for other in rays[last + 1 : i]} & {
+        alternating = {other.junction for other in rays[last + 1 : i]} & {
             other.junction for other in [*rays[:last], *rays[i + 1 :]]
         }
-        for junction in crossing - {ray.junction}:
+        for junction in alternating - {ray.junction}:
             end = corner[ray.junction]
             rays = [
                 x._replace(junction=ray.junction, path=[*x.path, end]) if x.junction == junction else x for x in rays

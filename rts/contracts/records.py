@@ -277,8 +277,8 @@ class Sampled(_OnCells):
             Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        stencil: areas and fluxes beside outlines, for splatters that read them, or None. Its samples are rows of each
-            part behind those of cells.
+        stencil: areas and boundary terms beside outlines, for splatters that read them, or None. Its samples are rows
+            of each part behind those of cells.
     """
 
     samples: tuple[Samples, ...]
@@ -313,7 +313,7 @@ class Splats(_OnCells):
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         border: cells at each side that splat into the image but are no part of it.
         opaque: a promise that alpha is 1 at all samples.
-        stencil: areas and fluxes beside outlines, if the splatter reads them; arrays of the positions' engine.
+        stencil: areas and boundary terms beside outlines, if the splatter reads them; arrays of the positions' engine.
         supersample: s; each pixel is the mean of s² cells, which a splatter's `cropped` may take itself.
     """
 

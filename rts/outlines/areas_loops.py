@@ -117,7 +117,7 @@ def _fill_rates(rates, s, h, e, t, own, share, pull):
     """Fill the rates (2, 2, 4) of the ray from an end e of row h, to the corner of segment s; see `_weigh_ray`.
 
     The ray runs along the segment s from where it meets that, and moves as that; t, own and share are of `_meets`, and
-    have no effect if s is h.
+    have no effect if s is h, where t is 0.
     """
     for r in range(4):
         rates[0, 0, r] = 1.0 if r == 1 + e else 0.0
@@ -324,7 +324,7 @@ def add_dual_cells(begin, end, outlines, shown, at_centres, entries):
     """Add the entries of segments, dual cell after dual cell, of those that have cells in lines `begin` to `end`.
 
     From each crossing on a dual cell's sides a ray goes to a junction inside: the corner of its segment, or of the one
-    that this ends at or crosses. Between the rays lie regions. Other arguments as of `_add_sides`.
+    that this ends at or crosses. Between the rays lie regions. Other arguments as of `stencil_loops._add_sides`.
 
     Returns:
         The numbers of entries of colours, and of motions.

@@ -80,12 +80,12 @@ def limited(
     Warns:
         InputWarning: some are left out.
     """
-    crossings, stacks = find(seams)
+    crossings, stacks = _contiguous(*find(seams))
     count = len(crossings.gap)
     if most is None or count <= most:
         return crossings, stacks, 0
     if seams:
-        crossings, stacks = find(False)
+        crossings, stacks = _contiguous(*find(False))
     left_out = count - min(most, len(crossings.gap))
     warn(
         f"{left_out} edge crossings find no room beside {most}, and edges there neither move nor are smooth; "
@@ -94,3 +94,8 @@ def limited(
     )
     crossings = Crossings(*(x if name == "joined" else x[:most] for name, x in crossings._asdict().items()))
     return crossings, stacks if stacks is None else Stacks(*(x[:most] for x in stacks)), left_out
+
+
+def _contiguous(crossings: Crossings, stacks: Stacks | None) -> tuple[Crossings, Stacks | None]:
+    """Crossings in contiguous arrays, however they were found: loops are compiled for each layout of a record."""
+    return Crossings(*map(np.ascontiguousarray, crossings)), stacks

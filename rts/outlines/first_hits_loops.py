@@ -31,7 +31,7 @@ ALIKE = 1e-5
 """Share of the depth by which a sample at a centre may differ from a span of its surface."""
 
 SHORT = 2e-5
-"""Length of a piece of front that counts."""
+"""Length of a piece of first hits that counts."""
 
 CREASE = np.cos(np.pi / 9)
 """Cosine of the angle by which a surface turns at a seam; less if both triangles are large. Of many small triangles

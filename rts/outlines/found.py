@@ -62,7 +62,7 @@ class Outlines(NamedTuple):
         place, kind = np.empty(count), np.empty(count, np.int32)
         segments_loops.places(crossings.gap, crossings.place, crossings.kind, place, kind)
         layered = sides is not None
-        sides = np.empty((count, 2, 0), np.int32) if sides is None else sides
+        sides = np.empty((count, 2, 0), np.int32) if sides is None else np.ascontiguousarray(sides, np.int32)
         of_crossings = place, crossings.gap, kind, crossings.slope, crossings.ends
         return cls(rows, sides, *of_crossings, joined(crossings, layered), crossings.joined, left_out)
 
@@ -84,7 +84,7 @@ class Outlines(NamedTuple):
             samples = last, last, none, stack
         else:
             samples = *self._colored(rows, row[0], required), rows[:, 4:], self.sides
-        beside = loops.Beside(*map(np.ascontiguousarray, samples))
+        beside = loops.BesideRows(*map(np.ascontiguousarray, samples))
         found: Any = loops.entries(self, beside, read_only(row, np.int32), real)
         (cell, sample, weight), (moved_cell, mover, rates, jumps), stacks = found
         stacks = stacks if self.sides.shape[2] else None

@@ -414,7 +414,7 @@ class _Change(NamedTuple):
         )
         part = np.take_along_axis(part, order, 0)
         at = np.take_along_axis(at, order[..., None], 0)
-        return Stacks(last, part.T, np.full(part.T.shape, -1), at.transpose(1, 0, 2), sides, numbers.T)
+        return Stacks(last, part.T, np.full(part.T.shape, -1, np.int32), at.transpose(1, 0, 2), sides, numbers.T)
 
 
 def _numbers(part: np.ndarray) -> np.ndarray:

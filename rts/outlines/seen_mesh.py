@@ -22,7 +22,7 @@ class SeenMesh(NamedTuple):
     Attributes:
         first: the index of the first part.
         starts: (P + 1,) int32, where the triangles of each part begin.
-        vertices: (V, 3) float32.
+        vertices: (V, 3) float32, or float64 of joint parts.
         faces: (T, 3) int32.
         adjacent: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it,
             and at seams, if they are wanted.
@@ -99,7 +99,8 @@ class SeenMesh(NamedTuple):
         from rts.outlines import silhouettes_loops
 
         count, mark = len(self.faces), silhouettes_loops.mark_silhouettes
-        parallel(mark, count, self, hits.part, hits.depth, width, met, work=10 * count)
+        seen = read_only(hits.part), read_only(hits.depth)
+        parallel(mark, count, self, *seen, width, met, work=10 * count)
 
     def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.

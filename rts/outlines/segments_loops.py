@@ -391,7 +391,7 @@ def _within(point, origin, s):
 
 @loop
 def corners(first, last, segments, neighbours, place, tangent, triangle):
-    """Fill `corner` (S, 2), from the dual cell's first centre, and `pull` (S, 4) of segments; see `Outlines`.
+    """Fill `corner` (S, 2), from the dual cell's first centre, and `pull` (S, 4) of segments; see `Segments`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
     at its neighbours, it is a curve. Its tangents at the ends run as from the crossing before each to the one after;

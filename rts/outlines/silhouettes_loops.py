@@ -12,7 +12,7 @@ from rts.sampling.points_loops import corners_of, edge
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""
 
-LARGE = 6
+ANY_SIZE = 6
 """The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
 n − 0.52 cells wide and high: where they meet a gap, their vertices are at most n − 1 cells away from its two cells."""
 
@@ -21,7 +21,7 @@ n − 0.52 cells wide and high: where they meet a gap, their vertices are at mos
 def turns(first, last, mesh):
     """Fill the `sides` of a `SeenMesh`: which side of a triangle is seen, by the sign of its determinant.
 
-    They are multiplied by the triangle's size; see `LARGE`.
+    They are multiplied by the triangle's size; see `ANY_SIZE`.
 
     Args:
         first: the first triangle.
@@ -39,7 +39,7 @@ def turns(first, last, mesh):
         if area == 0 or not whole:
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
         wide = max(_extent(a, b, c, seen, 0), _extent(a, b, c, seen, 1))
-        size = int(min(wide + np.float32(1.52), np.float32(LARGE))) if whole else LARGE
+        size = int(min(wide + np.float32(1.52), np.float32(ANY_SIZE))) if whole else ANY_SIZE
         sides[t] = size * ((area > 0) - (area < 0))
 
 

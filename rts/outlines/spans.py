@@ -50,7 +50,7 @@ def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.nda
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
     first_hits_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, kind, triangles, ends, same)
     slope, tangent, away = moving_edges(kind, beside, triangles, points[:, 0], meshes, width)
-    place, last, inner = map(np.ascontiguousarray, (points[:, 0], points[:, 1:3], points[:, 3:]))
+    place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]
     return Crossings(gap, place, kind, slope, ends, last, inner, beside, same, triangles, tangent, away)
 
 

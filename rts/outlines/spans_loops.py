@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.silhouettes_loops import LARGE as ANYWHERE
+from rts.outlines.silhouettes_loops import ANY_SIZE
 from rts.sampling.points_loops import corners_of, edge
 
 TINY = 1e-9
@@ -57,7 +57,7 @@ def around(gap, cells):
 
     The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside,
     and so on, for each of the `REACHES`. A triangle that meets a gap has all its vertices in cells that are marked so,
-    by its size; see `silhouettes_loops.LARGE`.
+    by its size; see `silhouettes_loops.ANY_SIZE`.
     """
     width, count, marked = cells.shape[1], cells.size, cells.reshape(-1)
     room = width * REACHES[-1]
@@ -163,7 +163,7 @@ def most_spans(first, last, mesh, close, gaps, most):
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         # Sizes 4 and 5 share the last of the marks.
-        axes = (close[a] & close[b] & close[c]) >> 2 * (min(size, 4) - 1) & 3 if size < ANYWHERE else 3
+        axes = (close[a] & close[b] & close[c]) >> 2 * (min(size, 4) - 1) & 3 if size < ANY_SIZE else 3
         if axes == 0:
             continue
         _box(a, b, c, seen, height, width, box)

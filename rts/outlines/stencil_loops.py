@@ -16,7 +16,7 @@ BANDS, SEGMENTS = 8, 400
 own, so that results are the same for any number of threads."""
 
 
-class Beside(NamedTuple):
+class BesideRows(NamedTuple):
     """The samples beside crossings. Host arrays, int32, −1 for none.
 
     Attributes:
@@ -302,8 +302,8 @@ def _of_crossings(outlines, beside, cells):
 def _further_stacks(outlines, stack, row, shown):
     """Stacks (R, K): two of each crossing, then those of cells in which one layer is a crossing's.
 
-    Also returns the number (B,) of each crossing's first of the latter. `stack` is that of `Beside`; `shown` (B, 2) are
-    the colours of `Shown`.
+    Also returns the number (B,) of each crossing's first of the latter. `stack` is that of `BesideRows`; `shown` (B, 2)
+    are the colours of `Shown`.
     """
     gap, ends = outlines.gap, outlines.ends
     layers, count, r = len(row), len(gap), 2 * len(gap)
@@ -342,7 +342,7 @@ def _in_lines(begin, end, outlines, beside, shown, row, at_centres):
     return *_sorted_colors(colors, parts, n, start, cells, at_centres), motions, rates, order
 
 
-def entries(outlines: Any, beside: Beside, row: np.ndarray, real: Any) -> Any:
+def entries(outlines: Any, beside: BesideRows, row: np.ndarray, real: Any) -> Any:
     """The entries of a stencil; see `rts.contracts.records.Stencil`.
 
     Args:

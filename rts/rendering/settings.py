@@ -24,9 +24,9 @@ APRON = 2
 """Cells sampled beyond each side of the image where no splatter tells its reach."""
 
 OUTLINES_APRON = 1
-"""How many more are sampled where outlines are found: how an outline turns within the squares of the outermost cells is
-told by the two crossings that come next along it, the second of which is two cells farther out. So a window, or a view
-beside others, shows of them what the whole image does."""
+"""How many more are sampled where outlines are found: how an outline turns within the dual cells of the outermost cells
+is told by the two crossings that come next along it, the second of which is two dual cells farther out. So a window, or
+a view beside others, shows of them what the whole image does."""
 
 
 @dataclass(frozen=True)

@@ -481,3 +481,23 @@ def test_opengl_draws_itself_what_is_no_larger_than_a_room():
     vertices, faces, camera = ground(100.0, 0.1)
     found = rasterize("opengl", vertices, faces, camera, (64, 64))  # Warnings are errors.
     assert (found.triangle_ids >= 0).sum() > 2000
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_scale_does_not_matter(sampler, scale):
+    vertices, faces = soup(300, 7, size=0.3)
+    vertices = (vertices * scale).astype(np.float32)
+    planes = {"aspect": 1.25, "near": 0.5 * scale, "far": 9 * scale}
+    for camera in (
+        Camera.look_at(np.array([1, 2, 3]) * scale, (0, 0, 0), fov_y=50, **planes),
+        Camera.orthographic(np.array([1, 2, 3]) * scale, (0, 0, 0), height=3 * scale, **planes),
+    ):
+        expected = rasterize("reference", vertices, faces, camera, SIZE, 4)
+        check(sampler, rasterize(sampler, vertices, faces, camera, SIZE, 4), expected)
+
+
+def test_planes_far_apart_do_not_coarsen_the_depth(sampler):
+    vertices, faces = soup(300, 7, size=0.3)
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), aspect=1.25, near=1e-4, far=1e6)
+    expected = rasterize("reference", vertices, faces, camera, SIZE, 4)
+    check(sampler, rasterize(sampler, vertices, faces, camera, SIZE, 4), expected)

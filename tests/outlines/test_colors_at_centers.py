@@ -13,6 +13,7 @@ pytestmark = pytest.mark.splatting
 
 SIZE = (24, 32)
 CAMERA = rts.Camera.look_at((0.3, 0.5, 3), (0, 0, 0), fov_y=40)
+CAMERAS = [CAMERA, rts.Camera.look_at((-1, 0.2, 3), (0, 0, 0), fov_y=40)]
 VERTICES, FACES = icosphere(2, 0.7)
 NEAR = (VERTICES * 0.6 + [0.3, 0.2, 0.9]).astype(np.float32)
 WIRE = np.array([[-1, -0.3, 1], [1, 0.3, 1], [1, 0.34, 1], [-1, -0.26, 1]], np.float32)
@@ -115,3 +116,36 @@ def test_glass_has_its_samples_beside_outlines():
 def test_other_words_are_refused():
     with pytest.raises(rts.InputError, match="colors is 'centres'; expected 'outlines' or 'centers'"):
         EDGES(colors="centres")
+
+
+def test_every_way_draws_the_same():
+    jax = pytest.importorskip("jax")
+    expected = np.asarray(rts.render(scene(False), CAMERA, SIZE, splatter=CENTERS).detach())
+    moving = scene(False, lambda x: torch.tensor(x, requires_grad=True))
+    ways = {
+        "moving": rts.render(moving, CAMERA, SIZE, splatter=CENTERS),
+        "views": rts.render_views(scene(False), CAMERAS, SIZE, splatter=CENTERS)[0],
+        "views that move": rts.render_views(moving, CAMERAS, SIZE, splatter=CENTERS)[0],
+        "views of several kinds": rts.render_views(
+            [scene(False)[0].replace(cull="back"), *scene(False)[1:]], CAMERAS, SIZE, splatter=CENTERS
+        )[0],
+        "samples": rts.render_samples(
+            rts.sample(scene(False), CAMERA, SIZE, splatter=CENTERS), scene(False), CAMERA, splatter=CENTERS
+        ),
+    }
+    host = [part.replace(theta={k: np.asarray(v) for k, v in part.theta.items()}) for part in scene(False)]
+
+    def drawn(vertices):
+        first = host[0].replace(theta={**host[0].theta, "vertices": vertices})
+        return rts.render([first, *host[1:]], CAMERA, SIZE, splatter=CENTERS)
+
+    ways |= {
+        "numpy": rts.render(host, CAMERA, SIZE, splatter=CENTERS),
+        "jit": jax.jit(drawn)(jax.numpy.asarray(VERTICES)),
+    }
+    ways["vmap"] = jax.vmap(drawn)(jax.numpy.asarray(VERTICES)[None])[0]
+    ways["jax"] = drawn(jax.numpy.asarray(VERTICES))
+    for name, way in ways.items():
+        np.testing.assert_allclose(image(way), expected, atol=3e-5, err_msg=name)
+    plain = np.asarray(rts.render(host, CAMERA, SIZE))
+    assert 0.001 < np.abs(plain - expected).max()

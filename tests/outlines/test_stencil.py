@@ -91,7 +91,7 @@ def test_boundary_terms_are_those_of_rays(number):
     np.add.at(found, stencil.motion_cell, rates * jump)
     # A crossing moves as the sample of the surface that ends there.
     rows, kind = outlines.rows, outlines.kind
-    crossing = kind == 2
+    intersect = kind == 2
     ending = rows[np.arange(len(kind)), np.minimum(kind, 1)]
     checked = 0
     for cell in np.unique(stencil.motion_cell):
@@ -99,7 +99,7 @@ def test_boundary_terms_are_those_of_rays(number):
         for (endpoint, mover), terms in area_rule.boundary_terms(
             outlines, divmod(int(cell), at_centres.shape[1]), BORDER
         ).items():
-            known &= not crossing[mover] and ending[mover] >= 0
+            known &= not intersect[mover] and ending[mover] >= 0
             before, behind = of[rows[endpoint, 0]], of[rows[endpoint, 1]]
             expected += float(terms @ moves[ending[mover]]) * (before - behind)
         if known:

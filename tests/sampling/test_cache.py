@@ -628,3 +628,35 @@ def test_a_render_of_a_handle_warns_of_vertices_that_have_changed(kind):
     for call in (draw, lambda: rts.render(handle, CAMERA, SIZE)):
         with pytest.warns(rts.errors.InputWarning, match="vertices of part 0 have changed since rts.prepare"):
             call()
+
+
+def test_scenes_of_embree_are_released_with_their_surface(monkeypatch):
+    sampler = counting("embree")
+    from rts_backends.embree import library as embree_library
+
+    released, release = [], embree_library._release
+
+    def record(*args):
+        released.append(args)
+        release(*args)
+
+    monkeypatch.setattr(embree_library, "_release", record)
+    part = part_of(*icosphere(1))
+    for scale in (1.0, 0.9, 0.8, 0.7):
+        theta = {"vertices": part.theta["vertices"] * np.float32(scale)}
+        rts.render(part.replace(theta=theta), CAMERA, SIZE, sampler=sampler)
+    assert not released and len(sampler.prepared) == KEPT
+    del part
+    gc.collect()
+    assert len(released) == KEPT
+
+
+def test_a_fingerprint_changes_with_the_order():
+    data = np.arange(64, dtype=np.float64)
+    seen = {fingerprint(data)}
+    for i in range(64):
+        for j in range(i + 1, 64):
+            swapped = data.copy()
+            swapped[[i, j]] = swapped[[j, i]]
+            seen.add(fingerprint(swapped))
+    assert len(seen) == 1 + 64 * 63 // 2

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from example_surfaces import Crowded, SeenMesh
+from example_surfaces import Crowded, Sheets
 from helpers import ALL, FRONT, arrays, rigid, to_numpy
 from seen import CAMERA, SIZE, VIEWS, rays_spread
 
@@ -111,7 +111,7 @@ HEIGHTS = np.array([0.5, 0.0, -0.5], np.float32)
 
 
 def sheets(refining, heights=HEIGHTS, **options):
-    return rts.Part(SeenMesh(refining), {"heights": heights}, **options)
+    return rts.Part(Sheets(refining), {"heights": heights}, **options)
 
 
 def layers_of(part, camera=FRONT, **options):
@@ -176,7 +176,7 @@ def spoiled(array, at):
     ],
 )
 def test_what_refine_may_not_give_is_refused_in_its_name(change, words):
-    class Tabled(SeenMesh):
+    class Tabled(Sheets):
         def table_specs(self, rows, capacity):
             spec = ArraySpec((rows, 1), np.float32, packed=True, by_sample=True)
             return {"places": ArraySpec((10, 2), np.float32, packed=True), "own": spec}
@@ -237,7 +237,7 @@ def test_sheets_that_change_places_are_seen_in_their_new_order(target):
 
 @pytest.mark.parametrize("by", [1e3, 1e4])
 def test_layers_of_a_model_in_small_units_are_not_merged(by):
-    class Large(SeenMesh):  # The same squares in units of which `by` make one of the world's.
+    class Large(Sheets):  # The same squares in units of which `by` make one of the world's.
         def proxy(self, inputs, camera, size):
             proxy = super().proxy(inputs, camera, size)
             return proxy._replace(vertices=proxy.vertices * np.float32(by))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from example_surfaces import part_of
+from found_outlines import noted
 from helpers import icosphere
 from test_edges_pairs import CAMERA
 
@@ -68,3 +69,32 @@ def test_every_kind_of_surface_is_found_in_a_program(surface, most):
 
     pose = np.float32(0.3 * POSE)
     np.testing.assert_allclose(jax.jit(drawn)(jnp.asarray(pose)), drawn(torch.tensor(pose)), atol=most)
+
+
+@thorough
+def test_crossings_beyond_the_room_are_counted():
+    """Needles whose outlines have more crossings than a program has room for, unless it is given more."""
+    count = 90
+    x = np.linspace(1, 27, count) + np.random.default_rng(0).uniform(-0.05, 0.05, count)
+    foot = np.column_stack([x, np.full(count, 23.0), np.full(count, -3.0)])
+    tip = np.column_stack([x + 0.2, np.full(count, 1.0), np.full(count, -3.0)])
+    vertices = np.float32(np.stack([foot, foot + [0.12, 0, 0], tip], 1).reshape(-1, 3))
+    faces = np.arange(3 * count).reshape(-1, 3)
+    height, width = SIZE
+    projection = np.array([[2 / width, 0, 0, -1], [0, -2 / height, 0, 1], [0, 0, -0.02, -1], [0, 0, 0, 1]])
+    camera = rts.Camera(np.eye(4), projection)
+
+    def sampled(vertices, **options):
+        part = rts.Part(rts.Mesh(faces), {"vertices": vertices}, "silhouette")
+        return rts.sample(part, camera, SIZE, splatter="edges", **options)
+
+    vertices = jnp.asarray(vertices)
+    with noted() as seen:
+        sampled(vertices)
+        with pytest.warns(rts.errors.InputWarning, match="edge crossings find no room beside"):
+            short = jax.block_until_ready(jax.jit(sampled)(vertices))
+    found, *_, room = (len(outlines.place) for outlines, _ in seen)
+    assert found > room
+    assert abs(int(short.overflow) - (found - room)) <= 2
+    enough = jax.jit(lambda v: sampled(v, capacity=4 * found + 40))(vertices)
+    assert int(enough.overflow) == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from cards import SIZE, covered, flat, in_pixels, turned, two_colors
+from cards import SIZE, TWO, covered, flat, in_pixels, turned, two_colors
 from found_outlines import sampled_with_outlines
 from helpers import icosphere, pushed
 
@@ -192,3 +192,26 @@ def test_corners_of_a_proxy_need_a_row_a_face():
     part = rts.Part(Odd([[0, 1, 2], [0, 2, 3], [0, 3, 1]]), {"vertices": np.eye(4, 3, dtype=np.float32)}, "unlit")
     with pytest.raises(rts.InputError, match=r"has 3 faces, but corners of shape \(2, 3\)"):
         rts.render(part, CAMERA, (8, 8))
+
+
+def test_every_way_draws_the_same():
+    jax = pytest.importorskip("jax")
+    part = box()
+    expected = np.asarray(rts.render(part, CAMERA, (32, 40)))
+
+    def drawn(vertices):
+        return rts.render(part.replace(theta={**part.theta, "vertices": vertices}), CAMERA, (32, 40))
+
+    vertices = part.theta["vertices"]
+    small = rts.Part(rts.Mesh(TWO), {"vertices": np.float32([[9, 9, 9], [10, 9, 9], [9, 10, 9], [9, 9, 9]])}, "unlit")
+    ways = {
+        "torch": drawn(torch.tensor(vertices, requires_grad=True)).detach(),
+        "jax": drawn(jax.numpy.asarray(vertices)),
+        "jit": jax.jit(drawn)(jax.numpy.asarray(vertices)),
+        "vmap": jax.vmap(drawn)(jax.numpy.asarray(vertices)[None])[0],
+        "views": rts.render_views(part, [CAMERA, CAMERA], (32, 40))[1],
+        "two parts": rts.render([part, small], CAMERA, (32, 40)),
+        "prepared": rts.render(rts.prepare(part), CAMERA, (32, 40)),
+    }
+    for name, image in ways.items():
+        np.testing.assert_allclose(np.asarray(image), expected, atol=3e-5, err_msg=name)
