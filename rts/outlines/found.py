@@ -17,10 +17,10 @@ from rts.sampling.scene import Scene
 
 
 class Outlines(NamedTuple):
-    """Outlines between the centres of cells: places where a front ends, joined into segments. Host arrays.
+    """Outlines between the centres of cells: places where an edge crosses, joined into segments. Host arrays.
 
-    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
-    another surface, or across a seam, is a crossing. Four neighbouring centres are the corners of a dual cell;
+    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the first hit changes
+    to another surface, or across a seam, is a crossing. Four neighbouring centres are the corners of a dual cell;
     crossings on its sides are joined into segments.
 
     Attributes:

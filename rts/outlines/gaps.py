@@ -1,7 +1,7 @@
 """Records of what is seen at centres, of the gaps between these, and of the crossings in gaps.
 
 A crossing is a place between neighbouring centres where a layer that is seen ends, or two intersect. Of opaque surfaces
-there is one layer, the front.
+there is one layer, that of first hits.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Crossings(NamedTuple):
         points: (B, 2, 2) float64, x and y of the last samples before and behind each crossing.
         inner: (B, 2, 2) float64, x and y of the samples that tell colours.
         parts: (B, 2) int32, their parts, or −1.
-        joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
+        joined: (2, H, W) bool: does the surface of each cell's first hit go on to the next cell's, along x and along y?
         triangles: (B, 4) int32, the triangles of these samples, in order; −1 where none is known.
         tangent: (B, 2) float64, the outline's unit direction in the image, either way; 0 where it is unknown.
         cells_away: (B,) float64, how many cells, each as deep as it is wide, the surface that ends is away, but for a

@@ -66,16 +66,16 @@ class AtOnce:
         if required is None:
             return self._sampled(seen, None, uniform)[0]
         joint, size, count = self._joint, self._grid.size, most
-        meshes = SeenMesh.of(
+        mesh = SeenMesh.of(
             joint.proxy, joint.camera, size, "none", 0, joint.proxies, seams=required.colors, keep=joint.signs
         )
         width = pixel_widths(on_host(self._grid.camera).for_size(size), size)
         layers = Hits(seen.row, seen.triangle, seen.depth.astype(np.float64))
-        find = partial(crossings_of_meshes, layers, self._opaque, (meshes,), width)
+        find = partial(crossings_of_meshes, layers, self._opaque, (mesh,), width)
         while True:
             crossings, stacks, left_out = limited(find, count, required.colors)
             wanted, sides = Beside.of(crossings, stacks, required), None if stacks is None else stacks.sides
-            sampled, rows = self._sampled(seen, meshes.at(wanted.triangle, wanted.points), uniform)
+            sampled, rows = self._sampled(seen, mesh.at(wanted.triangle, wanted.points), uniform)
             outlines = Outlines.of(crossings, wanted.table(len(crossings.gap), rows), sides, left_out)
             stencil = outlines.stencil(sampled.row, required, real)
             if fits(stencil, most) or not count:

@@ -37,7 +37,7 @@ class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], required: Required):
-        """Take of each part its sampler, camera, entry and, where triangles tell all, patches."""
+        """Take of each part its sampler, camera, entry and, where triangles tell all, the seen mesh."""
         self._scene, self._grid, self._parts, self._required = scene, grid, parts, required
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
@@ -55,14 +55,14 @@ class Points:
         for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
-            camera, meshes = scene.local_camera(index, grid), None
+            camera, mesh = scene.local_camera(index, grid), None
             if isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if lies_on_triangles(part, sampler):
                     seen = entry.proxy.seen_by(host)
-                    meshes = SeenMesh.of(entry.proxy, seen, grid.size, part.cull, index, seams=required.colors)
-            parts.append((sampler, camera, entry, meshes))
+                    mesh = SeenMesh.of(entry.proxy, seen, grid.size, part.cull, index, seams=required.colors)
+            parts.append((sampler, camera, entry, mesh))
         return cls(scene, grid, parts, required)
 
     def outlines(self, layers: Hits, most: int | None = None) -> tuple[Outlines, np.ndarray, list[Samples]]:
@@ -152,8 +152,8 @@ class Points:
 
     def _on_triangles(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
-        meshes = self._parts[part][-1]
-        return meshes.at(triangles, points) if meshes is not None and (triangles >= 0).all() else None
+        mesh = self._parts[part][-1]
+        return mesh.at(triangles, points) if mesh is not None and (triangles >= 0).all() else None
 
     def _of_layers(
         self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None
@@ -179,13 +179,13 @@ class Points:
         layers: int = 1,
     ) -> Samples:
         """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
-        (sampler, camera, entry, meshes), checked = self._parts[part], self._scene.parts[part]
+        (sampler, camera, entry, mesh), checked = self._parts[part], self._scene.parts[part]
         if fragments is None and len(points):
             # Engines that compile eager operations for each shape get few: further rows repeat the first point.
             arrays = checked.theta, camera
             more = engine_of(*arrays).room(len(points), exemplar(*arrays)) - len(points)
             points = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
-        if not len(points) and (meshes is None or _refines(checked)):
+        if not len(points) and (mesh is None or _refines(checked)):
             # Surfaces may want a ray at least; nothing names its sample.
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:

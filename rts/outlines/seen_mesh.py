@@ -56,7 +56,7 @@ class SeenMesh(NamedTuple):
         seams: bool = False,
         keep: np.ndarray | None = None,
     ) -> SeenMesh:
-        """The patches of a proxy.
+        """The triangles of a proxy as a camera sees them.
 
         Args:
             proxy: the triangles.

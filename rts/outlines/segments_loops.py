@@ -175,8 +175,8 @@ def _join(begins, ends, place, tangent, cells_away, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each dual cell.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts
-    intersect, either is in front. The least cost of
-    ends i … j of a dual cell is found from that of shorter runs, so that no two segments cross.
+    intersect, either is in front. The least cost of ends i … j of a dual cell is found from that of shorter runs, so
+    that no two segments cross.
 
     Args:
         begins: (Q + 1,) where the ends of each dual cell begin.

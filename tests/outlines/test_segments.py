@@ -51,7 +51,7 @@ def test_the_crossings_before_and_after_a_segment_are_in_order():
 
 
 OUTLINE, ENTERS, CROSSING = 1, -1, 0
-"""Kinds of ends: one where the way around a dual cell leaves a front, one where it enters it, and one of a crossing."""
+"""Kinds of ends: where the way around a dual cell leaves a front, where it enters it, and at an intersection."""
 
 
 @pytest.mark.parametrize("names", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
