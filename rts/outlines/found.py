@@ -19,9 +19,9 @@ from rts.sampling.scene import Scene
 class Outlines(NamedTuple):
     """Outlines between the centres of cells: places where an edge crosses, joined into segments. Host arrays.
 
-    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the first hit changes
-    to another surface, or across a seam, is a crossing. Four neighbouring centres are the corners of a dual cell;
-    crossings on its sides are joined into segments.
+    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the first hit
+    changes to another surface, or across a seam, is a crossing. Four neighbouring centres are the corners of a dual
+    cell; crossings on its sides are joined into segments.
 
     Attributes:
         rows: (B, 6) int32, for each crossing two samples that tell motions, before and behind it along its gap; two
