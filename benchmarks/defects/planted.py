@@ -123,7 +123,7 @@ LOOPS = [
         "edges edges_bodies",
     ),
     Defect(
-        "the farther of two surfaces ends at a break",
+        "the farther of two surfaces ends at a crossing",
         "rts/outlines/first_hits_loops.py",
         "(0 if z < deep else 1)\n",
         "(1 if z < deep else 0)\n",
@@ -144,7 +144,7 @@ LOOPS = [
         "seen_mesh edges_soups edges",
     ),
     Defect(
-        "a walk that leaves a sheet by another triangle joins it",
+        "a walk that leaves a patch by another triangle joins it",
         "rts/outlines/seen_mesh_loops.py",
         "joined[axis, y, x] = end == s\n",
         "joined[axis, y, x] = end >= 0\n",
@@ -200,14 +200,14 @@ LOOPS = [
         "edges edges_bodies",
     ),
     Defect(
-        "the breaks before a segment are swapped",
+        "the crossings before a segment are swapped",
         "rts/outlines/segments_loops.py",
         "found[s, (1 - far) if e == 0 else 2 + far]",
         "found[s, far if e == 0 else 2 + far]",
         "segments edges edges_bodies",
     ),
     Defect(
-        "flux along y has the sign of that along x",
+        "the boundary term along y has the sign of that along x",
         "rts/outlines/areas_loops.py",
         "terms[s, k, i, r, 1] -= rate * dx",
         "terms[s, k, i, r, 1] += rate * dx",
@@ -228,7 +228,7 @@ LOOPS = [
         "stencil edges_meetings",
     ),
     Defect(
-        "lines of crossing do not know of depth",
+        "lines of intersection do not know of depth",
         "rts/outlines/stencil_loops.py",
         "moves[b, i, 2, a] = sign\n",
         "moves[b, i, 2, a] = 0 * sign\n",
@@ -270,7 +270,7 @@ LOOPS = [
         "edges_operations edges_glass",
     ),
     Defect(
-        "what ends beside a break moves as layers that go on",
+        "what ends beside a crossing moves as layers that go on",
         "rts/outlines/stencil_loops.py",
         "stays |= stack[b, 1 - i, other] == there",
         "stays |= stack[b, i, other] == there",
@@ -393,7 +393,7 @@ ARRAYS = [
         "seen_mesh edges",
     ),
     Defect(
-        "the farther of two layers moves a break",
+        "the farther of two layers moves a crossing",
         "rts/outlines/halving.py",
         "(depths[1] < depths[0]).astype(np.int32)",
         "(depths[1] > depths[0]).astype(np.int32)",

@@ -220,7 +220,7 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
     """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
     from rts.outlines.gaps import Gaps
     from rts.outlines.seen_mesh import SeenMesh
-    from rts.outlines.silhouettes_loops import LARGE
+    from rts.outlines.silhouettes_loops import ANY_SIZE
 
     clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
     faces, none = np.array([[0, 1, 2], [1, 0, 2]], np.int32), np.full((2, 3), -1, np.int32)
@@ -232,7 +232,9 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
-            own = SeenMesh(0, np.int32([0, 1]), vertices, faces, none, rows, clip, both, seen, np.int8([LARGE, LARGE]))
+            own = SeenMesh(
+                0, np.int32([0, 1]), vertices, faces, none, rows, clip, both, seen, np.int8([ANY_SIZE, ANY_SIZE])
+            )
             names, spans, _ = own.spans(Gaps.of(marks), True)
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
