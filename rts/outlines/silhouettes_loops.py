@@ -40,7 +40,7 @@ def turns(first, last, mesh):
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
         wide = max(_extent(a, b, c, seen, 0), _extent(a, b, c, seen, 1))
         size = int(min(wide + np.float32(1.52), np.float32(ANY_SIZE))) if whole else ANY_SIZE
-        sides[t] = size * ((area > 0) - (area < 0))
+        sides[t] = size * (int(area > 0) - int(area < 0))
 
 
 @compiled(inline="always")
