@@ -186,7 +186,7 @@ LOOPS = [
         "segments edges",
     ),
     Defect(
-        "the lower side of a square is counted from the left",
+        "the lower side of a dual cell is counted from the left",
         "rts/outlines/segments_loops.py",
         "(3 - x if side == 2 else 4 - y)",
         "(2 + x if side == 2 else 4 - y)",
@@ -194,7 +194,7 @@ LOOPS = [
     ),
     Defect(
         "outlines that turn have no corners",
-        "rts/outlines/segments_loops.py",
+        "rts/outlines/corners_loops.py",
         "x, y = x + alone * (sharp[0] - x), y + alone * (sharp[1] - y)",
         "x, y = x + 0.0, y + 0.0",
         "edges edges_bodies",
@@ -215,7 +215,7 @@ LOOPS = [
     ),
     Defect(
         "outlines of glass do not cross",
-        "rts/outlines/segments_loops.py",
+        "rts/outlines/corners_loops.py",
         "crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)",
         "crosses = False",
         "edges_meetings",

@@ -141,16 +141,6 @@ class SeenMesh(NamedTuple):
         parallel(seen_mesh_loops.on_planes, count, *arguments, work=50 * count)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None])
 
-    def edges(self, kind: np.ndarray, *arrays: np.ndarray) -> None:
-        """Fill in what the triangles tell of the edges at crossings; see `silhouettes_loops.edges`.
-
-        `arrays` are the parts, triangles and points of crossings, then slopes, depths and tangents, which are filled.
-        """
-        from rts.outlines import silhouettes_loops
-
-        arguments = kind, *arrays[:3], self, *arrays[3:]
-        parallel(silhouettes_loops.edges, len(kind), *arguments, work=100 * len(kind))
-
 
 _welds: dict[int, tuple[weakref.ref, np.ndarray, np.ndarray]] = {}
 

@@ -44,6 +44,7 @@ def joined(crossings: Crossings, layered: bool = False) -> Segments:
 
     Outlines of one part do not cross. With `layered`, those of different parts may, since light passes through them.
     """
+    from rts.outlines import corners_loops
     from rts.outlines import segments_loops as loops
 
     size = crossings.joined.shape[1:]
@@ -62,7 +63,7 @@ def joined(crossings: Crossings, layered: bool = False) -> Segments:
     count, adjacent = len(endpoints), np.empty((len(endpoints), 2), np.int32)
     numbers = np.zeros(count, np.int32), adjacent, np.empty((count, 2)), np.empty((count, 4))
     segments = Segments(origin, endpoints, dual_sides, *numbers)
-    parallel(loops.corners, count, segments, neighbours, *known, triangle, work=150 * count)
-    loops.join_lone_ends(segments, neighbours, *known, crossings.kind)
+    parallel(corners_loops.corners, count, segments, neighbours, *known, triangle, work=150 * count)
+    corners_loops.join_lone_ends(segments, neighbours, *known, crossings.kind)
     adjacent[:] = neighbours[:, 1:3]
     return segments

@@ -93,7 +93,8 @@ def moving_edges(
     slope, depth, tangent = np.zeros((len(kind), 2, 2)), np.full(len(kind), np.nan), np.zeros((len(kind), 2))
     known = read_only(parts), read_only(triangles), read_only(points)
     for mesh in meshes:
-        mesh.edges(kind, *known, slope, depth, tangent)
+        arguments = kind, *known, mesh, slope, depth, tangent
+        parallel(silhouettes_loops.edges, len(kind), *arguments, work=100 * len(kind))
     away = np.empty(len(kind))
     silhouettes_loops.finish_directions(width, depth, kind, slope, tangent, away)
     return slope, tangent, away

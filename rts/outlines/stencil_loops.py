@@ -130,22 +130,14 @@ def _add_sides(begin, end, outlines, beside, shown, row, at_centres, entries, co
     """
     width, (n, m), (colors, parts, motions, rates) = at_centres.shape[1], counts, entries
     gap, place, ends, joined = outlines.gap, outlines.place, outlines.ends, outlines.joined
-    rows, stack, shown_colors, normal, first_stack = (
-        beside.last,
-        beside.stack,
-        shown.colors,
-        shown.normals,
-        shown.first_stack,
-    )
+    rows, stack, first_stack = beside.last, beside.stack, shown.first_stack
+    shown_colors, normal = shown.colors, shown.normals
     for b in range(len(gap)):
         nx, ny, right = normal[b, 0], normal[b, 1], gap[b, 2]
         if gap[b, 0] >= end or gap[b, 0] + 1 - right < begin:
             continue
-        ahead, step, further = (
-            nx * right + ny * (1 - right),
-            right + (1 - right) * width,
-            at_centres.size + first_stack[b],
-        )
+        ahead, step = nx * right + ny * (1 - right), right + (1 - right) * width
+        further = at_centres.size + first_stack[b]
         for i in range(2):
             last, way = shown_colors[b, i], 1 - 2 * i
             y, x = gap[b, 0] + i * (1 - right), gap[b, 1] + i * right
