@@ -298,7 +298,7 @@ def join_lone_ends(segments, neighbours, place, tangent, kind):
                 junction[s] = 0
                 continue
         if endpoints[other, 1] < 0:
-            corner[s] = corner[other]
+            corner[s, 0], corner[s, 1] = corner[other, 0], corner[other, 1]
             continue
         e = 0 if on[s] < 1 else 1
         share = on[s] if e == 0 else 2 - on[s]

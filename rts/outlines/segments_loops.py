@@ -218,18 +218,18 @@ def _cost(a, b, ends, place, tangent, cells_away):
 def _read(first, n, step, partner):
     """Fill in the partners of the n ends from `first` on, as `step` says of all runs of ends."""
     stack, top = np.empty((2 * n + 2, 2), np.int32), 1
-    stack[0] = 0, n
+    stack[0, 0], stack[0, 1] = 0, n
     while top > 0:
         top -= 1
-        i, m = stack[top]
+        i, m = stack[top, 0], stack[top, 1]
         if m < 1:
             continue
         k = step[i, m]
-        stack[top] = i + 1, m - 1 if k < 0 else k - 1
+        stack[top, 0], stack[top, 1] = i + 1, m - 1 if k < 0 else k - 1
         top += 1
         if k >= 0:
             partner[first + i], partner[first + i + k] = first + i + k, first + i
-            stack[top] = i + k + 1, m - k - 1
+            stack[top, 0], stack[top, 1] = i + k + 1, m - k - 1
             top += 1
 
 
