@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.compiling.threads import read_only
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Required
+from rts.outlines import samples_loops
 from rts.outlines.gaps import Crossings, Hits, Stacks
+from rts.outlines.required import Required
 from rts.outlines.seen_mesh import SeenMesh
 from rts.outlines.spans import crossings_of_triangles
 
@@ -36,8 +38,6 @@ class Beside(NamedTuple):
     @classmethod
     def of(cls, crossings: Crossings, stacks: Stacks | None, required: Required) -> Beside:
         """The samples that stand for `required` beside crossings of one layer, or that stacks have there."""
-        from rts.outlines import samples_loops
-
         if stacks is not None:
             parts = np.concatenate([stacks.last, stacks.parts], 1)
             (place,) = (parts.reshape(-1) >= 0).nonzero()
@@ -62,6 +62,7 @@ def crossings_of_meshes(
     layers: Hits, opaque: np.ndarray, meshes: Sequence[SeenMesh], width: np.ndarray, seams: bool
 ) -> tuple[Crossings, Stacks | None]:
     """The crossings between what is seen at centres (K, H, W); of several layers, nothing behind an opaque one."""
+    layers = Hits(*map(read_only, layers))
     if len(layers.part) == 1:
         return crossings_of_triangles(Hits(*(x[0] for x in layers)), meshes, width, seams), None
     from rts.outlines.stacks import crossings_of_stacks

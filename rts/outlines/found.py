@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -10,10 +9,11 @@ import numpy as np
 
 from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
+from rts.outlines import segments_loops
+from rts.outlines import stencil_loops as loops
 from rts.outlines.gaps import Crossings
+from rts.outlines.required import Required
 from rts.outlines.segments import Segments, joined
-from rts.sampling.entries import is_still
-from rts.sampling.scene import Scene
 
 
 class Outlines(NamedTuple):
@@ -56,8 +56,6 @@ class Outlines(NamedTuple):
     @classmethod
     def of(cls, crossings: Crossings, rows: np.ndarray, sides: np.ndarray | None = None, left_out: int = 0) -> Outlines:
         """Outlines of crossings whose samples are `rows`; `sides` are there if light passes through, see `joined`."""
-        from rts.outlines import segments_loops
-
         count = len(rows)
         place, kind = np.empty(count), np.empty(count, np.int32)
         segments_loops.places(crossings.gap, crossings.place, crossings.kind, place, kind)
@@ -74,8 +72,6 @@ class Outlines(NamedTuple):
             required: what samples tell.
             real: the dtype of weights.
         """
-        from rts.outlines import stencil_loops as loops
-
         rows = self.rows
         last, none = rows[:, :2], np.full((len(rows), 2), -1, np.int32)
         if self.sides.shape[2]:
@@ -137,30 +133,3 @@ def arrays_of(stencil: Stencil) -> list[Any]:
 
 
 FIELDS = tuple(field.name for field in fields(Stencil))
-
-
-class Required(NamedTuple):
-    """The tasks of samples beside a crossing. Of one layer two samples tell colours or motions, and four tell both.
-
-    Attributes:
-        colors: False if each part has one colour, which any of its samples tells.
-        motions: False if nothing moves (`is_still`) and colours are to be told.
-        centers: True if samples at centres tell the colours of surfaces that reach these: see `colored_at_centers`.
-    """
-
-    colors: bool = True
-    motions: bool = True
-    centers: bool = False
-
-    @classmethod
-    def of(cls, scenes: Sequence[Scene], centers: bool) -> Required:
-        """The tasks that the shaders of scenes, and derivatives in their values, set."""
-        # Of one colour any two samples tell all, those of motions too.
-        uniform = all(part.uniform for scene in scenes for part in scene.parts)
-        return cls(not uniform, uniform or not all(map(is_still, scenes)), centers and not uniform)
-
-    def samples(self, layers: int) -> int:
-        """The largest number of samples of a crossing, but for a pair."""
-        if layers > 1:
-            return layers + 3
-        return 4 if self.colors and self.motions and not self.centers else 2

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.outlines import spans_loops
+
 INNER = 0.1
 """Distance from a crossing, in cells, of the samples that tell colours; half the way to the next if that is less."""
 
@@ -49,7 +51,7 @@ class Gaps(NamedTuple):
         gap: (M, 3) int32, y and x of the first centre; 1 for a gap along a row, 0 along a column.
         rows: (H, W) int32, how many of them come before each centre of a row.
         columns: (W, H) int32, and of a column.
-        around: (H, W) int8, the cells of gaps and those beside; see `spans_loops.around`.
+        around: (H, W) int8, the cells of gaps and those before; see `spans_loops.around`.
     """
 
     gap: np.ndarray
@@ -60,8 +62,6 @@ class Gaps(NamedTuple):
     @classmethod
     def of(cls, marks: np.ndarray) -> Gaps:
         """The gaps that are marked (2, H, W), along rows and along columns."""
-        from rts.outlines import spans_loops
-
         (height, width), gap = marks.shape[1:], np.empty((np.count_nonzero(marks), 3), np.int32)
         rows, columns = np.empty((height, width), np.int32), np.empty((width, height), np.int32)
         spans_loops.number(marks, gap, rows, columns)

@@ -14,10 +14,13 @@ import numpy as np
 
 from rts.compiling.threads import parallel
 from rts.contracts.records import Cells, Fragments, Sampled
+from rts.outlines import samples_loops
 from rts.outlines.beside import Beside, crossings_of_meshes, limited
-from rts.outlines.found import Outlines, Required, fits
+from rts.outlines.found import Outlines, fits
 from rts.outlines.gaps import Hits
+from rts.outlines.required import Required
 from rts.outlines.seen_mesh import SeenMesh
+from rts.sampling import packing_loops
 from rts.sampling.camera_checks import on_host
 from rts.sampling.joint import Joint, is_suited
 from rts.sampling.points import pixel_widths
@@ -40,9 +43,6 @@ class AtOnce:
 
     def centres(self, layers: int) -> Sampled:
         """The surfaces seen at centres (K, H, W). `Sampled.row` has parts, or −1; `found` tells the samples."""
-        from rts.outlines import samples_loops
-        from rts.sampling import packing_loops
-
         shape = layers, *self._grid.size
         self._fragments = self._joint.drawn(self._grid.size, layers)
         part, triangle, depth = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, np.float32)
@@ -84,8 +84,6 @@ class AtOnce:
 
     def _sampled(self, seen: Sampled, beside: Fragments | None, uniform: bool) -> tuple[Sampled, np.ndarray]:
         """The samples at centres, and those of fragments (1, 1, M) beside crossings, whose rows (M,) are told."""
-        from rts.sampling import packing_loops
-
         joint, part = self._joint, seen.row
         starts, table, corners = joint.starts, joint.proxy.ids, joint.proxy.corner_params
         assert self._fragments is not None and table is not None

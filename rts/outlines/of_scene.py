@@ -16,8 +16,9 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Outlines, Required, arrays_of, fits, specs
+from rts.outlines.found import Outlines, arrays_of, fits, specs
 from rts.outlines.points import Points, at_centres, has_pairs
+from rts.outlines.required import Required
 from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
 from rts.sampling.host_scenes import real_of
 from rts.sampling.picture import renumbered

@@ -17,9 +17,10 @@ from rts.arrays.trees import Array, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
-from rts.outlines.found import Required, arrays_of, fits, specs
+from rts.outlines.found import arrays_of, fits, specs
 from rts.outlines.of_joint import AtOnce
 from rts.outlines.of_scene import most_crossings
+from rts.outlines.required import Required
 from rts.sampling.entries import is_batched
 from rts.sampling.host_call import SampleBounds, attribute_specs
 from rts.sampling.host_scenes import from_values, real_of, values_of

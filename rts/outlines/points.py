@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, exemplar, host_value
 from rts.arrays.trees import Tree
+from rts.compiling.threads import read_only
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.sampler import Sampler
@@ -17,9 +18,10 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.outlines.beside import Beside, crossings_of_meshes, limited
 from rts.outlines.edge_kinds import BEHIND_ENDS, INTERSECT
-from rts.outlines.found import Outlines, Required
+from rts.outlines.found import Outlines
 from rts.outlines.gaps import Crossings, Gaps, Hits, Stacks
 from rts.outlines.halving import Hints, Oracle, find_crossings
+from rts.outlines.required import Required
 from rts.outlines.seen_mesh import SeenMesh
 from rts.plugin_base import overrides
 from rts.registry import name_of
@@ -135,9 +137,9 @@ class Points:
                 several.append(mesh)
         if not several:
             return None
-        front = Hits(*(x[0] for x in layers))
+        front = Hits(*(read_only(x[0]) for x in layers))
         if len(layers.part) > 1:
-            front = front._replace(part=np.full_like(front.part, -1))
+            front = front._replace(part=read_only(np.full_like(front.part, -1)))
         met = np.zeros((2, *front.part.shape), np.uint8)
         for mesh in several:
             mesh.mark_silhouettes(front, self._width, met)

@@ -11,7 +11,9 @@ import numpy as np
 
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
+from rts.outlines import seen_mesh_loops, silhouettes_loops, spans_loops
 from rts.outlines.gaps import Gaps, Hits
+from rts.sampling.packing_loops import in_one
 from rts.sampling.points import near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
@@ -31,6 +33,7 @@ class SeenMesh(NamedTuple):
         keep: (T,) int8, the sign of the determinants on screen of triangles that are kept; 0 for both.
         seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
         sides: (T + 1,) int8, which side of triangles is seen, and 0; see `silhouettes_loops.turns`.
+        cells: (T,) int32, the (flat) cells of the upper left corners of their boxes; see there.
     """
 
     first: int
@@ -43,6 +46,7 @@ class SeenMesh(NamedTuple):
     keep: np.ndarray
     seen: np.ndarray
     sides: np.ndarray
+    cells: np.ndarray
 
     @classmethod
     def of(
@@ -68,9 +72,6 @@ class SeenMesh(NamedTuple):
             seams: whether patches end at seams (`Proxy.corners`), too.
             keep: see above; None for what `cull` says.
         """
-        from rts.outlines import seen_mesh_loops, silhouettes_loops
-        from rts.sampling.packing_loops import in_one
-
         # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
@@ -87,39 +88,30 @@ class SeenMesh(NamedTuple):
         adjacent = [_adjacent(table) for table in tables]
         adjacent = adjacent[0] if len(adjacent) == 1 else in_one(adjacent, starts[:-1].tolist())
         keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
-        mesh = cls(first, starts, vertices, faces, adjacent, rows, near_and_far(camera), keep, seen, sides)
-        parallel(silhouettes_loops.turns, len(faces), mesh, work=5 * len(faces))
+        cells, clip = np.empty(len(faces), np.int32), near_and_far(camera)
+        mesh = cls(first, starts, vertices, faces, adjacent, rows, clip, keep, seen, sides, cells)
+        parallel(silhouettes_loops.turns, len(faces), mesh, *size, work=5 * len(faces))
         return mesh
 
     def mark_silhouettes(self, hits: Hits, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a patch may end or turn away; see the loop of this name.
 
-        `hits` (H, W) are seen at centres; for `width` see `Oracle`.
+        `hits` (H, W), read-only, are seen at centres; for `width` see `Oracle`.
         """
-        from rts.outlines import silhouettes_loops
-
         count, mark = len(self.faces), silhouettes_loops.mark_silhouettes
-        seen = read_only(hits.part), read_only(hits.depth)
-        parallel(mark, count, self, *seen, width, met, work=10 * count)
+        parallel(mark, count, self, hits.part, hits.depth, width, met, work=10 * count)
 
     def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
 
-        `hits` (H, W) are seen at centres; for `met` see `mark_silhouettes`.
+        `hits` (H, W), read-only, are seen at centres; for `met` see `mark_silhouettes`.
         """
-        from rts.outlines import seen_mesh_loops
-
-        arguments = *map(read_only, hits), self, met, joined
-        parallel(seen_mesh_loops.seams, len(joined[0]), *arguments, work=8 * joined[0].size)
+        parallel(seen_mesh_loops.seams, len(joined[0]), *hits, self, met, joined, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
-        from rts.outlines import spans_loops
-
-        close = np.empty(len(self.seen), np.int8)
-        parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
-        parallel(spans_loops.most_spans, count, self, close, gaps, most, work=40 * count)
+        parallel(spans_loops.most_spans, count, self, gaps, most, work=10 * count)
         (triangles,) = most.nonzero()
         most = most[triangles]
         ends = most.cumsum()
@@ -133,8 +125,6 @@ class SeenMesh(NamedTuple):
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> Fragments:
         """Fragments (1, 1, M) of triangles (M,) at points (M, 2)."""
-        from rts.outlines import seen_mesh_loops
-
         count = len(triangle)
         weights, depth = np.empty((count, 2), np.float32), np.empty(count, np.float32)
         arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth
@@ -187,8 +177,6 @@ _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 def _adjacent(faces: np.ndarray) -> np.ndarray:
     """`SeenMesh.adjacent`; that of a read-only table that owns its memory is kept as long as the table."""
-    from rts.outlines import seen_mesh_loops
-
     kept, key = not faces.flags.writeable and faces.flags.owndata, id(faces)
     if kept and key in _known and _known[key][0]() is faces:
         return _known[key][1]

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling.threads import parallel
+from rts.outlines import corners_loops
+from rts.outlines import segments_loops as loops
 from rts.outlines.gaps import Crossings
 
 
@@ -44,9 +46,6 @@ def joined(crossings: Crossings, layered: bool = False) -> Segments:
 
     Outlines of one part do not cross. With `layered`, those of different parts may, since light passes through them.
     """
-    from rts.outlines import corners_loops
-    from rts.outlines import segments_loops as loops
-
     size = crossings.joined.shape[1:]
     dual, along, ends = loops.ends_of(crossings.gap, crossings.place, crossings.kind, crossings.parts, *size)
     # By dual cells; in each of them clockwise, part by part if outlines may cross.

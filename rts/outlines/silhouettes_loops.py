@@ -14,21 +14,26 @@ SLACK = 0.01
 
 ANY_SIZE = 6
 """The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
-n − 0.52 cells wide and high: where they meet a gap, their vertices are at most n − 1 cells away from its two cells."""
+n − 0.52 cells wide and high: where they meet a gap, one of its two cells is among the n × n cells at the upper left
+corner of their box."""
 
 
 @loop
-def turns(first, last, mesh):
+def turns(first, last, mesh, height, width):
     """Fill the `sides` of a `SeenMesh`: which side of a triangle is seen, by the sign of its determinant.
 
-    They are multiplied by the triangle's size; see `ANY_SIZE`.
+    They are multiplied by the triangle's size; see `ANY_SIZE`. And fill the `cells` of triangles, beyond the border of
+    the image the nearest one; any number for those that are seen in part.
 
     Args:
         first: the first triangle.
         last: the triangle after the last.
         mesh: the triangles.
+        height: of the image, in cells.
+        width: likewise.
     """
     rows, vertices, faces, seen, sides = mesh.rows, mesh.vertices, mesh.faces, mesh.seen, mesh.sides
+    cells, right, bottom = mesh.cells, np.float32(width - 1), np.float32(height - 1)
     corners = np.empty((3, 4))
     for t in range(first, last):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -38,15 +43,12 @@ def turns(first, last, mesh):
         whole = not np.isnan(area)
         if area == 0 or not whole:
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        wide = max(_extent(a, b, c, seen, 0), _extent(a, b, c, seen, 1))
+        x, y = min(seen[a, 0], seen[b, 0], seen[c, 0]), min(seen[a, 1], seen[b, 1], seen[c, 1])
+        wide = max(max(seen[a, 0], seen[b, 0], seen[c, 0]) - x, max(seen[a, 1], seen[b, 1], seen[c, 1]) - y)
         size = int(min(wide + np.float32(1.52), np.float32(ANY_SIZE))) if whole else ANY_SIZE
         sides[t] = size * (int(area > 0) - int(area < 0))
-
-
-@compiled(inline="always")
-def _extent(a, b, c, seen, axis):
-    """How long a triangle is along an axis of the image."""
-    return max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
+        x, y = min(max(x, np.float32(0)), right), min(max(y, np.float32(0)), bottom)
+        cells[t] = int(y) * width + int(x) if whole else 0
 
 
 @loop

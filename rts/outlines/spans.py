@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.compiling.threads import parallel, read_only
+from rts.compiling.threads import parallel
+from rts.outlines import first_hits_loops, silhouettes_loops, spans_loops
 from rts.outlines.gaps import INNER, Crossings, Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
 
@@ -21,36 +22,34 @@ def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.nda
     """The crossings between the first hits (H, W) at the centres of all cells.
 
     Args:
-        hits: what is seen at centres.
+        hits: what is seen at centres, read-only.
         meshes: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         seams: whether there are crossings where a surface goes on across edges that its triangles do not share, and
             they are large, or turn there: colours may change.
     """
-    from rts.outlines import first_hits_loops, spans_loops
-
     met = np.zeros((2, *hits.part.shape), np.uint8)
     for mesh in meshes:
         mesh.mark_silhouettes(hits, width, met)
     joined = np.zeros(met.shape, np.bool_)
     for mesh in meshes:
         mesh.join(hits, met, joined)
-    marks, same, front = np.empty_like(joined), np.empty_like(joined), read_only(hits.part)[None]
-    parallel(spans_loops.wanted, len(met[0]), front, joined, met, marks, same, work=hits.part.size)
+    marks, same = np.empty_like(joined), np.empty_like(joined)
+    parallel(spans_loops.wanted, len(met[0]), hits.part[None], joined, met, marks, same, work=hits.part.size)
     gaps = Gaps.of(marks)
     begins, names, spans, parts = spans_on(gaps, meshes, seams)
     count = len(gaps.gap)
     room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
-    seen = *map(read_only, hits), np.empty((count, 2, 2), np.int32), np.empty((count, 2))
+    seen = *hits, np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     known = gaps.gap, begins, spans, names, parts, *seen, INNER, rows, counts, whole, numbers
     parallel(first_hits_loops.crossings, count, *known, work=600 * count)
     count = counts.sum()
     gap, points, kind = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
     first_hits_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, kind, triangles, ends, same)
-    slope, tangent, away = moving_edges(kind, beside, triangles, points[:, 0], meshes, width)
-    place, last, inner = points[:, 0], points[:, 1:3], points[:, 3:]
+    place, last, inner = points[:, 0].copy(), points[:, 1:3], points[:, 3:]
+    slope, tangent, away = moving_edges(kind, beside, triangles, place, meshes, width)
     return Crossings(gap, place, kind, slope, ends, last, inner, beside, same, triangles, tangent, away)
 
 
@@ -61,8 +60,6 @@ def spans_on(
 
     See `SeenMesh.spans`.
     """
-    from rts.outlines import spans_loops
-
     several = [mesh.spans(gaps, seams) for mesh in meshes]
     names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
@@ -88,12 +85,9 @@ def moving_edges(
         meshes: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
-    from rts.outlines import silhouettes_loops
-
     slope, depth, tangent = np.zeros((len(kind), 2, 2)), np.full(len(kind), np.nan), np.zeros((len(kind), 2))
-    known = read_only(parts), read_only(triangles), read_only(points)
     for mesh in meshes:
-        arguments = kind, *known, mesh, slope, depth, tangent
+        arguments = kind, parts, triangles, points, mesh, slope, depth, tangent
         parallel(silhouettes_loops.edges, len(kind), *arguments, work=100 * len(kind))
     away = np.empty(len(kind))
     silhouettes_loops.finish_directions(width, depth, kind, slope, tangent, away)

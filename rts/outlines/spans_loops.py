@@ -16,7 +16,7 @@ TINY = 1e-9
 """Shortest length of a span."""
 
 REACHES = 0, 1, 2, 4
-"""How many cells away from gaps there are marks for triangles; see `around`."""
+"""How many cells before gaps there are marks for triangles; see `around`."""
 
 LARGE = 16.0
 """Area in the image, in cells, from which on triangles are large."""
@@ -53,30 +53,29 @@ def wanted(first, last, part, joined, met, gaps, same):
 
 @loop
 def around(gap, cells):
-    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around.
+    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those to the left and above.
 
-    The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those beside,
-    and so on, for each of the `REACHES`. A triangle that meets a gap has all its vertices in cells that are marked so,
-    by its size; see `silhouettes_loops.ANY_SIZE`.
+    The cells of a gap have 1 if it is one along a row, 2 along a column; so have, times four, these and those that are
+    one cell before, and so on, for each of the `REACHES`. A triangle that meets a gap has its cell among those that are
+    marked so, by its size; see `silhouettes_loops.ANY_SIZE`.
     """
     width, count, marked = cells.shape[1], cells.size, cells.reshape(-1)
     room = width * REACHES[-1]
-    marks, wider = np.zeros(count + 2 * room, np.int8), np.zeros(count + 2 * room, np.int8)
+    marks, wider = np.zeros(count + room, np.int8), np.zeros(count + room, np.int8)
     for n in range(len(gap)):
-        kind, at = 2 - gap[n, 2], room + gap[n, 0] * width + gap[n, 1]
+        kind, at = 2 - gap[n, 2], gap[n, 0] * width + gap[n, 1]
         marks[at] |= kind
         marks[at + (1 if kind == 1 else width)] |= kind
     for n in range(len(REACHES)):
         for axis in range(2 if n > 0 else 0):
-            # Past the end of a row they reach into the next one, which does no harm.
+            # Before a row they reach into the one above, which does no harm.
             step = (REACHES[n] - REACHES[n - 1]) * (1 if axis == 0 else width)
-            before, own, behind, out = marks[room - step :], marks[room:], marks[room + step :], wider[room:]
+            behind = marks[step:]
             for i in range(count):
-                out[i] = before[i] | own[i] | behind[i]
+                wider[i] = marks[i] | behind[i]
             marks, wider = wider, marks
-        own = marks[room:]
         for i in range(count):
-            marked[i] |= own[i] << 2 * n
+            marked[i] |= marks[i] << 2 * n
 
 
 @loop
@@ -118,20 +117,6 @@ def _range(low, high, count):
     return int(min(max(np.ceil(low), 0.0), count)), int(max(min(np.floor(high), count - 1.0), -1.0)) + 1
 
 
-@loop
-def close(first, last, seen, cells, marks):
-    """Fill `marks` (V,) int8 with those of the cells (H, W) of vertices; beyond the border, of the nearest cell.
-
-    Vertices behind the camera have all marks.
-    """
-    height, width = cells.shape
-    for v in range(first, last):
-        x, y = seen[v, 0], seen[v, 1]
-        marks[v] = -1
-        if not np.isnan(x):
-            marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
-
-
 @compiled(inline="always")
 def _gaps_of(box, axis, height, width):
     """The lines of centres that a box meets, then the gaps of each: the first and the one after the last."""
@@ -143,30 +128,29 @@ def _gaps_of(box, axis, height, width):
 
 
 @loop
-def most_spans(first, last, mesh, close, gaps, most):
+def most_spans(first, last, mesh, gaps, most):
     """Fill `most` (T,) int32 with bounds on the numbers of spans of triangles.
 
     Args:
         first: the first triangle.
         last: the triangle after the last.
         mesh: the triangles, a `SeenMesh`.
-        close: (V,), see the loop of this name, of cells `around` gaps.
         gaps: the gaps.
         most: to fill.
     """
-    faces, seen, sides, keep, (_, by_row, by_column, _) = mesh.faces, mesh.seen, mesh.sides, mesh.keep, gaps
-    box, (height, width) = np.empty(4, np.float32), by_row.shape
+    faces, seen, sides, keep, cells = mesh.faces, mesh.seen, mesh.sides, mesh.keep, mesh.cells
+    by_row, by_column, marks, box = gaps.rows, gaps.columns, gaps.around.reshape(-1), np.empty(4, np.float32)
+    height, width = by_row.shape
     for t in range(first, last):
         most[t] = 0
         size = abs(sides[t])
         if size == 0 or sides[t] * keep[t] < 0:
             continue
-        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         # Sizes 4 and 5 share the last of the marks.
-        axes = (close[a] & close[b] & close[c]) >> 2 * (min(size, 4) - 1) & 3 if size < ANY_SIZE else 3
+        axes = marks[cells[t]] >> 2 * (min(size, 4) - 1) & 3 if size < ANY_SIZE else 3
         if axes == 0:
             continue
-        _box(a, b, c, seen, height, width, box)
+        _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, height, width, box)
         for axis in range(2):
             if axes & (1 + axis) == 0:
                 continue

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel, read_only
+from rts.outlines import spans_loops
+from rts.outlines import stacks_loops as loops
 from rts.outlines.gaps import INNER, Crossings, Gaps, Hits, Stacks
 from rts.outlines.seen_mesh import SeenMesh
 from rts.outlines.spans import moving_edges, spans_on
@@ -25,7 +27,7 @@ def crossings_of_stacks(
     """The crossings between the stacks at the centres of all cells, and the layers there.
 
     Args:
-        layers: what is seen at centres, arrays (K, H, W), front to back; nothing behind an opaque layer.
+        layers: what is seen at centres, arrays (K, H, W), read-only, front to back; nothing behind an opaque layer.
         opaque: (P,) bool, the parts that let no light through.
         meshes: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
@@ -39,8 +41,9 @@ def crossings_of_stacks(
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
     at = first + place[:, None] * along
     points = np.stack([first[:, k : k + 1] + places * along[:, k : k + 1] for k in (0, 1)], axis=-1)
-    slope, tangent, away = moving_edges(kind, samples[:, :2, 0], samples[:, :2, 1], at, meshes, width)
     last, stack = samples[:, :2], samples[:, 2:]
+    ended = last[..., 0].copy(), last[..., 1].copy()
+    slope, tangent, away = moving_edges(kind, *ended, at, meshes, width)
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
     ends, last_points = whole[:, 4:] == 1, points[:, :2]
     samples_of = last_points, last_points, whole[:, 2:4], joined, triangles
@@ -56,21 +59,20 @@ def _gaps_to_search(
 
     And of those with the same parts, which are some, at both centres.
     """
-    from rts.outlines import spans_loops
-
     count, *size = layers.part.shape
     ends = Hits(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
     for part, _, depth in zip(*layers, strict=True) if opaque.any() else ():
         solid = (part >= 0) & opaque[part]
         ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
     met, joined = np.zeros((2, *size), np.uint8), np.zeros((2, count * size[0], size[1]), np.bool_)
+    ends = Hits(*map(read_only, ends))
     for mesh in meshes:
         mesh.mark_silhouettes(ends, width, met)
     below = Hits(*(x.reshape(-1, size[1]) for x in layers))  # One layer after the other.
     for mesh in meshes:
         mesh.join(below, met, joined)
     marks, same = np.empty(met.shape, np.bool_), np.empty(met.shape, np.bool_)
-    parallel(spans_loops.wanted, size[0], read_only(layers.part), joined, met, marks, same, work=2 * layers.part.size)
+    parallel(spans_loops.wanted, size[0], layers.part, joined, met, marks, same, work=2 * layers.part.size)
     return marks, same
 
 
@@ -78,8 +80,6 @@ def _changes(
     gaps: Gaps, layers: Hits, opaque: np.ndarray, meshes: Sequence[SeenMesh], seams: bool
 ) -> tuple[np.ndarray, ...]:
     """The changes of stacks along gaps; see `stacks_loops.changes`."""
-    from rts.outlines import stacks_loops as loops
-
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
     begins, names, spans, parts = spans_on(gaps, meshes, seams)
     rows, counts, size = np.empty(count, np.int64), np.empty(count, np.int32), most + 3
@@ -88,7 +88,7 @@ def _changes(
         total = int(room[-1])
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
-        known = gap, begins, spans, names, parts, opaque, *map(read_only, layers[::2]), room, rows, counts
+        known = gap, begins, spans, names, parts, opaque, *layers[::2], room, rows, counts
         parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
         if not (rows < 0).any():
             break

@@ -8,7 +8,6 @@ from dataclasses import replace
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
-from rts.outlines.of_joint import AtOnce
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
 from rts.sampling.host_scenes import in_engine, on_the_host, real_of, with_attributes
@@ -90,6 +89,8 @@ def sampled_scene(
         return replace(sampled, supersample=factor, apron=apron)
     at_once, none = None, [False] * len(scene.parts)
     if scene.cameras and capacity is None and not settings.fronts:
+        from rts.outlines.of_joint import AtOnce
+
         # Samples do not spread, so that what lies behind an opaque one has no effect.
         at_once = AtOnce.of(scene, grid, scene.opaque if outlines else none)
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from rts.compiling.threads import thread_count
 from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
-from rts.outlines.found import Required
+from rts.outlines.required import Required
 from rts.plugin_base import promised
 from rts.sampling.layer_count import TRACED_LAYERS
 from rts.sampling.scene import Grid, Scene

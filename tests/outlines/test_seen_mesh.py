@@ -10,6 +10,7 @@ from rts.contracts.records import Proxy
 from rts.outlines import seen_mesh, spans_loops
 from rts.outlines.gaps import Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
+from rts.outlines.silhouettes_loops import ANY_SIZE
 from rts.scene.camera import Camera
 
 pytestmark = pytest.mark.sampling
@@ -152,13 +153,28 @@ def test_a_span_is_the_chord_of_a_triangle(wide, faces):
         np.testing.assert_allclose([a / c, (a + b) / (c + d)], 5, atol=1e-5)
 
 
-def test_cells_around_a_gap_are_marked():
+def test_cells_before_a_gap_are_marked():
     cells = np.zeros((11, 12), np.int8)
     spans_loops.around(np.array([(5, 5, 1)], np.int32), cells)
     expected = np.zeros((11, 12), np.uint8)
     for size, away in enumerate((0, 1, 2, 4)):
-        expected[5 - away : 6 + away, 5 - away : 7 + away] |= 1 << 2 * size
+        expected[5 - away : 6, 5 - away : 7] |= 1 << 2 * size
     np.testing.assert_array_equal(cells.view(np.uint8), expected)
+
+
+def test_no_triangle_that_meets_a_gap_is_passed_over_for_its_size():
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(-3, 11, (500, 1, 2)) + rng.normal(size=(500, 3, 2)) * 10 ** rng.uniform(-1, 0.6, (500, 1, 1))
+    mesh = of(corners.reshape(-1, 2), np.arange(1500).reshape(-1, 3))
+    larger = mesh._replace(sides=np.sign(mesh.sides) * np.int8(ANY_SIZE))
+    assert set(np.abs(mesh.sides)) >= {1, 2, 3, 4, 5, 6}
+    for axis, y, x in np.argwhere(np.ones((2, *SIZE), bool)[:, :-1, :-1]):
+        marks = np.zeros((2, *SIZE), bool)
+        marks[axis, y, x] = True
+        gaps, counts = Gaps.of(marks), np.empty((2, 500), np.int32)
+        for looked_at, count in zip((mesh, larger), counts, strict=True):
+            spans_loops.most_spans(0, 500, looked_at, gaps, count)
+        np.testing.assert_array_equal(*counts)
 
 
 def test_patches_join_the_centres_between_which_they_go_on():

@@ -6,7 +6,7 @@ from found_outlines import sampled_with_outlines
 from helpers import icosphere
 
 import rts
-from rts.outlines.found import Required
+from rts.outlines.required import Required
 from rts.sampling.scene import Scene
 from rts_surfaces.implicit.narrow_band import NarrowBand
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from graphlib import CycleError, TopologicalSorter
@@ -30,8 +31,6 @@ APPS = {
     for path in sorted([*(ROOT / "apps").glob("*/rts_*/*.py"), *(ROOT / "apps").glob("*/*.py")])
     if path.name != "__init__.py"
 }
-
-COMPILING = ("rts.compiling.loops", "rts.compiling.numba_internals", "rts.plugin_api.loops")
 
 
 def imports(path, types=False):
@@ -191,13 +190,10 @@ def test_names_that_are_deprecated_go_in_the_version_that_they_told():
     assert versions and all(now < until for until in versions)
 
 
-def test_compiled_code_is_imported_when_it_is_needed():
-    for name, path in FILES.items():
-        if name.partition(".")[0] == "rts" and not name.endswith("_loops") and name not in COMPILING:
-            top = ast.parse(path.read_text()).body
-            named = {ast.unparse(n) for n in top if isinstance(n, (ast.Import, ast.ImportFrom))}
-            compiled = ("numba", "_loops import", *COMPILING)
-            assert not [n for n in named if any(x in n for x in compiled) or n.endswith("_loops")], name
+def test_numba_is_imported_when_something_is_computed():
+    program = "import sys, rts; rts.Mesh, rts.fit, rts.load; print([n for n in sys.modules if 'numba' in n])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "[]\n"
 
 
 def test_a_docstring_says_by_itself_what_it_speaks_of():

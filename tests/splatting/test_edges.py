@@ -224,7 +224,7 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
 
     clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
     faces, none = np.array([[0, 1, 2], [1, 0, 2]], np.int32), np.full((2, 3), -1, np.int32)
-    both = np.zeros(2, np.int8)
+    both, starts = np.zeros(2, np.int8), np.int32([0, 1])
     marks = np.zeros((2, 8, 8), bool)
     marks[0, :, :-1], marks[1, :-1] = True, True
     for side in (1e-25, -1e-25):
@@ -232,9 +232,8 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
-            own = SeenMesh(
-                0, np.int32([0, 1]), vertices, faces, none, rows, clip, both, seen, np.int8([ANY_SIZE, ANY_SIZE])
-            )
+            sides = np.int8([ANY_SIZE, ANY_SIZE])
+            own = SeenMesh(0, starts, vertices, faces, none, rows, clip, both, seen, sides, np.zeros(2, np.int32))
             names, spans, _ = own.spans(Gaps.of(marks), True)
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
