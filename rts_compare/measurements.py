@@ -25,9 +25,10 @@ from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
 
 PATIENCE = 8.0
-"""Seconds that a sampler may take for its first image; a slower one is left out."""
+"""Seconds that a sampler may take for a small image, after one of a single pixel that compiles its loops; a slower one
+is left out."""
 PROBE, SLOWEST = 8, 3.0
-"""Side of that first image, pixels; and the usual limit for an image of the scene's size, seconds."""
+"""Side of that small image, pixels; and the usual limit for an image of the scene's size, seconds."""
 ALIKE = 0.002
 """A sampler whose derivatives differ from the usual one's by at most this, relative L2, shares its errors."""
 
@@ -264,16 +265,16 @@ class Measurements:
 
     def _tried(self, name: str, parts: list[Part], camera: Camera) -> dict[str, Any]:
         """Try a sampler on the scene. Returns {"suits": True or False, "why": the reason if False}."""
-        side = PROBE
+        side = 1
         try:
-            for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
+            for size, patience in (((1, 1), LONGEST), ((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
                 side = size[0]
                 with limited(patience):
                     _quietly(lambda size=size: sample(parts, camera, size, sampler=name, splatter=None, layers=1))
         except InputError as error:
             return {"suits": False, "why": one_line(str(error))}
         except TooSlow as error:
-            return {"suits": False, "why": f"{error} for an image {side} pixels high"}
+            return {"suits": False, "why": f"{error} for an image {side} pixel{'s' * (side > 1)} high"}
         except Exception as error:
             return {"suits": False, "why": one_line(f"{type(error).__name__}: {error}")}
         return {"suits": True, "why": ""}
