@@ -258,6 +258,7 @@ def _peers(measured: Measurements, wanted: bool) -> tuple[list[Peer], list[str]]
 def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
     done = phase("truth", 4 * measured.samples**2 * len(measured.scene.directions))
     measured.truths(done)
+    measured.leave_out_what_hardly_changes()
     scene, rows = measured.scene, []
     modes = list(scene.directions)
     cells = {g: _cells(measured, plan, g) for g in dict.fromkeys(map(measured.group, modes))}

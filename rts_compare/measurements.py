@@ -32,6 +32,10 @@ PROBE, SLOWEST = 8, 3.0
 ALIKE = 0.002
 """A sampler whose derivatives differ from the usual one's by at most this, relative L2, shares its errors."""
 
+UNKNOWN, HARDLY = 0.2, 0.05
+"""The image hardly changes along a mode whose true derivative is this uncertain, and this small beside the largest of
+all modes: such as a turn of a vase about its axis. No setting has small errors relative to it."""
+
 TOGETHER = "all"
 """The name of the group of all modes, where all are differentiated at once."""
 
@@ -137,6 +141,18 @@ class Measurements:
         def changes(mode: str) -> None:
             if not np.linalg.norm(self.truth(mode, done).derivative) > 0:
                 raise self._rests(mode)
+
+        self._keep(changes)
+
+    def leave_out_what_hardly_changes(self) -> None:
+        """Drop the modes along which the image hardly changes, see `HARDLY`, each with a line in `left_out`."""
+        truths = {mode: self.truth(mode) for mode in self.scene.directions}
+        norms = {mode: np.linalg.norm(low_pass(truth.derivative)) for mode, truth in truths.items()}
+
+        def changes(mode: str) -> None:
+            share = float(norms[mode] / max(norms.values()))
+            if truths[mode].error > UNKNOWN and share < HARDLY:
+                raise InputError(f"the image hardly changes with {mode!r}: {share:.1g} of what it does otherwise")
 
         self._keep(changes)
 

@@ -132,6 +132,7 @@ def tune(
     measured.leave_out_what_rests()
     with phases(progress) as phase:
         _make_truths(measured, tolerance, budget_s / 2, phase, TRUTH_SAMPLES[1:] if truth_samples is None else ())
+        measured.leave_out_what_hardly_changes()
         deadline = time.perf_counter() + budget_s
         suited = measured.samplers(possible)
         if not suited:
@@ -139,6 +140,8 @@ def tune(
         search = Search(measured, measured.kinds(suited), tolerance, deadline, phase)
         chosen, reasons, error, seconds = search.run(named)
     reasons += _told_of_truths(measured, tolerance)
+    if resting := [mode for mode in found.directions if mode not in measured.scene.directions]:
+        reasons.append(f"the image hardly changes along {', '.join(resting)}: no errors are measured there")
     at = measured.at_rates(TOGETHER)[chosen.rate].at
     own = None if measured.scene.separate else measured.engine
     parts = parts_of(at(measured.scene.moved(next(iter(measured.scene.directions)), 0.0, own)))

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import quad
 from hypothesis import given
 from hypothesis import strategies as st
@@ -535,6 +536,23 @@ class TestTune:
         told = " | ".join(tuned.reasons)
         assert "sampler='raster': sampler='reference' takes 5 times as long" in told
         assert "supersample=" in told and "off by" in told
+
+    def test_a_turn_about_an_axis_of_symmetry(self, modelled, kept):
+        """A pillar's image hardly changes with its turn: relative to that, any derivative's error is large."""
+        import torch
+
+        pillar = trimesh.creation.cylinder(0.6, 1.2, sections=40)
+        pillar.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+        camera = rts.Camera.look_at((0, 1, 3), (0, 0, 0), fov_y=45)
+
+        def posed(pose):
+            theta = {"vertices": np.asarray(pillar.vertices, np.float32)}
+            return rts.Part(rts.Mesh(pillar.faces), theta, "silhouette", transform=rts.rigid(pose)), camera
+
+        pose = torch.zeros(6)
+        tuned = tune(posed, pose, tolerance=0.3, size=(32, 32), samplers=["raster"], truths=kept, **TRUTH)
+        assert tuned.error < 0.3
+        assert any("hardly changes along parameters[1]: no errors" in line for line in tuned.reasons), tuned.reasons
 
     @pytest.mark.thorough
     def test_rates(self, modelled, kept):
