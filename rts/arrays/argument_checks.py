@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import FunctionType
 from typing import Any
 
@@ -27,6 +28,16 @@ def quoted(value: Any) -> str:
     if isinstance(value, FunctionType):  # Its repr shows an address in memory.
         text = f"<function {value.__name__}>"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def in_short(tree: Any) -> str:
+    """A tree as its repr, but for arrays, which are told by dtype and shape: "{'vertices': float32 (8, 3)}"."""
+    if isinstance(tree, Mapping):
+        return "{" + ", ".join(f"{key!r}: {in_short(value)}" for key, value in tree.items()) + "}"
+    if isinstance(tree, (list, tuple)):
+        return "[" + ", ".join(map(in_short, tree)) + "]"
+    shape, dtype = shape_of(tree), getattr(tree, "dtype", None)
+    return f"{str(dtype).removeprefix('torch.')} {shape}" if shape and dtype is not None else quoted(tree)
 
 
 def one_line(error: Exception) -> str:

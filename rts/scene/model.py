@@ -103,6 +103,17 @@ class Model:
     cameras: tuple[Camera, ...]
     camera_names: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        counts = {
+            "part": self.parts,
+            "node": self.nodes,
+            "skin": self.skins,
+            "clip": self.clips,
+            "camera": self.cameras,
+        }
+        words = [f"{len(x)} {name}{'s' * (len(x) > 1)}" for name, x in counts.items() if x]
+        return f"Model({', '.join(words)})"
+
     def clip(self, clip: str | int) -> Clip:
         """The clip of a name, or of an index.
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from rts import registry
-from rts.arrays.argument_checks import quoted
+from rts.arrays.argument_checks import in_short, quoted
 from rts.arrays.trees import Array, Tree, record
 from rts.errors import InputError
 
@@ -37,6 +37,11 @@ class Part:
             raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
         if isinstance(self.shader, str):
             registry.check_name("rts.shaders", self.shader)
+
+    def __repr__(self) -> str:
+        transform = "" if self.transform is None else f", transform={in_short(self.transform)}"
+        cull = "" if self.cull == "none" else f", cull={self.cull!r}"
+        return f"Part({self.surface!r}, {in_short(self.theta)}, {quoted(self.shader)}{transform}{cull})"
 
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed; its fields are checked again."""

@@ -89,6 +89,12 @@ def bar():
     return Bar()
 
 
+def test_a_model_and_its_parts_are_shown_in_short(bar, tmp_path):
+    model = rts.load_model(bar.written(tmp_path))
+    assert repr(model) == "Model(1 part, 3 nodes, 1 skin, 1 clip)"
+    assert "'vertices': float32 (6, 3)" in repr(model.parts[0]) and len(repr(model.parts[0])) < 400
+
+
 def posed(model, *when):
     part = model.posed(model.pose(*when))[0]
     return part.surface.posed(part.theta)
