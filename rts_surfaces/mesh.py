@@ -45,12 +45,15 @@ class Mesh(TriangleSurface):
     param_step = 0.25
 
     def __init__(self, faces: ArrayLike, indices: Mapping[str, ArrayLike | None] | None = None):
+        if indices is not None and not isinstance(indices, Mapping):
+            raise InputError(
+                f"indices is {quoted(indices)}; expected a dict of name → (T, 3) integers. Vertices are no argument: "
+                "Part(Mesh(faces), {'vertices': vertices})"
+            )
         self.faces = index_table("faces", faces, 3)
         self.face_count = len(self.faces)
         self._tables = [self.faces]
         self._columns: dict[str, int] = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
-        if indices is not None and not isinstance(indices, Mapping):
-            raise InputError(f"indices is {quoted(indices)}; expected a dict of name → (T, 3) integers")
         check_names(indices or ())
         for name, table in (indices or {}).items():
             self._columns[name] = 0

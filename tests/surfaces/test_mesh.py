@@ -107,6 +107,11 @@ def test_tables_of_attributes_are_those_that_were_given():
     assert set(rts.Mesh(mesh.faces, mesh.indices).indices) == {"uv", "heat"} and rts.Mesh(faces).indices == {}
 
 
+def test_vertices_beside_faces_are_told_where_they_belong():
+    with pytest.raises(rts.InputError, match=r"\(T, 3\) integers. Vertices are no argument: Part\(Mesh\(faces\)"):
+        rts.Mesh(*quad())
+
+
 def test_more_rows_than_vertices_want_a_table():
     part = mesh_part(quad(), theta={"uv": np.zeros((6, 2))})
     with pytest.raises(
