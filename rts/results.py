@@ -3,11 +3,13 @@
 Images are arrays, and have no type of their own.
 """
 
+from rts.contracts.records import Sampled
 from rts.diagnostics.gradient_images import GradientImage
 from rts.diagnostics.gradients import GradientCheck
 from rts.diagnostics.notebooks import Shown
 from rts.diagnostics.profile import Profile
 from rts.fitting.fit import Fit
+from rts.registry import PluginInfo
 from rts.rendering.renderer import PreparedParts, Renderer
 from rts.sampling.auto import Choice
 from rts.scene.clips import Channel, Clip
@@ -23,10 +25,12 @@ __all__ = [
     "GradientImage",
     "Model",
     "Node",
+    "PluginInfo",
     "Pose",
     "PreparedParts",
     "Profile",
     "Renderer",
+    "Sampled",
     "Shown",
     "Skin",
 ]

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Engine
-from rts.diagnostics.measuring_api import output_folder, writing
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
+from rts.tool_api.files import output_folder, writing
 from rts_compare.compared_settings import Setting, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment

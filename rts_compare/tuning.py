@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Camera, Part, engine_of
-from rts.diagnostics.measuring_api import output_folder
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError
 from rts.plugin_api.arrays import Tree, map_leaves
 from rts.plugin_api.checks import check_positive, is_count, quoted
+from rts.tool_api.files import output_folder
 from rts_compare.compared_settings import usable
 from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.measurements import TOGETHER, Measurements

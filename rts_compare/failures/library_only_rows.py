@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Part, fit, plugin, render, rigid
-from rts.diagnostics.measuring_api import engine_named
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array
+from rts.tool_api.plugins import engine_named
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.failures import failure_scenes
 from rts_compare.failures.method_renderers import Own, Unable, quiet

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import rts
 from rts import registry
 from rts.capabilities import BASES
-from rts.cli.main import app
+from rts_cli.main import app
 
 pytestmark = pytest.mark.core
 
@@ -276,7 +276,7 @@ def test_listing_names_imports_no_plugin():
 
 def test_the_help_names_installed_commands_and_imports_none():
     code = (
-        "from rts.cli.main import app\n"
+        "from rts_cli.main import app\n"
         "try:\n    app(['--help'], prog_name='rts')\n"
         "except SystemExit as end:\n    print('ended with', end.code)\n"
         "print('loaded', *(name for name in sys.modules if name.startswith('rts_')))"
