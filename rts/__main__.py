@@ -1,8 +1,6 @@
 """The command `rts` as `python -m rts`."""
 
-from importlib.metadata import distribution
-
-from rts.registry import OWN
+from rts.registry import load_own
 
 if __name__ == "__main__":
-    distribution(OWN).entry_points.select(group="console_scripts")["rts"].load()()
+    load_own("console_scripts", "rts")()

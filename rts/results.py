@@ -3,13 +3,16 @@
 Images are arrays, and have no type of their own.
 """
 
+# pyright: reportUnsupportedDunderAll=false
+# Type checkers read `results.pyi`.
+
+from typing import Any
+
 from rts.contracts.records import Sampled
-from rts.diagnostics.gradient_images import GradientImage
-from rts.diagnostics.gradients import GradientCheck
 from rts.diagnostics.notebooks import Shown
 from rts.diagnostics.profile import Profile
 from rts.fitting.fit import Fit
-from rts.registry import PluginInfo
+from rts.registry import PluginInfo, load_own
 from rts.rendering.renderer import PreparedParts, Renderer
 from rts.sampling.auto import Choice
 from rts.scene.clips import Channel, Clip
@@ -21,8 +24,8 @@ __all__ = [
     "Choice",
     "Clip",
     "Fit",
-    "GradientCheck",
-    "GradientImage",
+    "GradientCheck",  # noqa: F822
+    "GradientImage",  # noqa: F822
     "Model",
     "Node",
     "PluginInfo",
@@ -34,3 +37,10 @@ __all__ = [
     "Shown",
     "Skin",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = load_own(__name__, name)
+    return found

@@ -15,10 +15,9 @@ registers them in the group "rts.testing" of entry points: `import rts` and the 
 # pyright: reportUnsupportedDunderAll=false
 # Type checkers read `testing.pyi`.
 
-from importlib.metadata import distribution
 from typing import Any
 
-from rts.registry import OWN
+from rts.registry import load_own
 
 KINDS = ("Engine", "Operation", "Sampler", "Shader", "Splatter", "Surface")
 __all__ = [f"{kind}Conformance" for kind in KINDS]
@@ -27,5 +26,5 @@ __all__ = [f"{kind}Conformance" for kind in KINDS]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = globals()[name] = distribution(OWN).entry_points.select(group=__name__)[name].load()
+    found = globals()[name] = load_own(__name__, name)
     return found

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Engine
-from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
@@ -29,6 +28,7 @@ from rts_compare.pareto_front import Row, best_within, front, marked
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
 from rts_compare.skip_reasons import one_line
 from rts_compare.true_derivatives import SAMPLES
+from rts_diagnostics.progress import Phase, phases
 
 LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4)

@@ -133,7 +133,7 @@ def test_without_the_packages_of_the_command_the_library_works_and_the_command_s
     printed = without(
         package,
         """
-        from rts.__main__ import main
+        from rts_cli.__main__ import main
         try:
             main()
         except SystemExit as stop:
@@ -156,7 +156,8 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         """
         from pathlib import Path
         from rts_cli import main, pose_report
-        assert pose_report._plot(Path("convergence.png"), [1.0, 0.1], [2]) == []
+        fit = rts.results.Fit(None, 0.1, [1.0, 0.1], 2, "", 0.0, (2,), [])
+        assert pose_report._plot(Path("convergence.png"), fit) == []
         main._say_skipped_plot([])
         """,
     )

@@ -107,7 +107,7 @@ def test_the_navigation_has_every_page():
 
 def messages():
     """The literal text of each string in the library; holes of f-strings are left out."""
-    for package in ("rts", "rts_backends", "rts_surfaces", "rts_cli", "rts_testing", "rts_compare"):
+    for package in ("rts", "rts_backends", "rts_surfaces", "rts_cli", "rts_diagnostics", "rts_testing", "rts_compare"):
         for path in (ROOT / package).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.JoinedStr):

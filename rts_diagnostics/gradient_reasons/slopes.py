@@ -7,13 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.engine_base import Engine
-from rts.arrays.engines import namespace
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.diagnostics.gradient_reasons.subject import DEEP, Subject
-from rts.diagnostics.smoothing import low_pass
-from rts.scene.camera import Camera
-from rts.scene.parts import Part
+from rts import Camera, Engine, Part, namespace
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts_diagnostics.gradient_reasons.subject import DEEP, Subject
+from rts_diagnostics.smoothing import low_pass
 
 NEGLIGIBLE = 0.01
 """The largest negligible effect, as a share of the largest effect of a step."""

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.gradient_reasons import variants
-from rts.diagnostics.gradient_reasons.reasons import Finding
-from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
-from rts.diagnostics.gradient_reasons.slopes import Number
-from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched
-from rts.diagnostics.gradient_reasons.vanishing import is_quiet, why_constant
-from rts.diagnostics.smoothing import low_pass
+from rts_diagnostics.gradient_reasons import variants
+from rts_diagnostics.gradient_reasons.reasons import Finding
+from rts_diagnostics.gradient_reasons.shader_steps import why_stepped
+from rts_diagnostics.gradient_reasons.slopes import Number
+from rts_diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched
+from rts_diagnostics.gradient_reasons.vanishing import is_quiet, why_constant
+from rts_diagnostics.smoothing import low_pass
 
 HALVED = 0.5
 """An experiment names a reason if it leaves less than this share of the error."""

@@ -10,22 +10,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import check_flag, quoted
-from rts.arrays.array_functions import kind_of
-from rts.arrays.engine_base import Engine
-from rts.arrays.engines import namespace
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import check_size, is_count, is_real
-from rts.diagnostics.gradient_images import check_callable, checked_parameters, traceable
-from rts.diagnostics.gradient_reasons.reasons import Reason, legend, marked
-from rts.diagnostics.gradient_reasons.second_derivatives import HessianCheck, curvatures, require_second_derivatives
-from rts.diagnostics.gradient_reasons.selection import explained
-from rts.diagnostics.gradient_reasons.shared_budget import Clock, looked_at
-from rts.diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Slope
-from rts.diagnostics.gradient_reasons.subject import Scene, Subject
-from rts.diagnostics.progress import phases
+from rts import Engine, namespace, render
 from rts.errors import EmptyImageWarning, InputError, InputWarning, LayersWarning
-from rts.rendering.image import render
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts.plugin_api.checks import is_count, quoted
+from rts.tool_api.parameters import is_real, kind_of
+from rts.tool_api.scenes import check_pixels
+from rts_diagnostics.gradient_images import check_callable, checked_parameters, traceable
+from rts_diagnostics.gradient_reasons.reasons import Reason, legend, marked
+from rts_diagnostics.gradient_reasons.second_derivatives import HessianCheck, curvatures, require_second_derivatives
+from rts_diagnostics.gradient_reasons.selection import explained
+from rts_diagnostics.gradient_reasons.shared_budget import Clock, looked_at
+from rts_diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Slope
+from rts_diagnostics.gradient_reasons.subject import Scene, Subject
+from rts_diagnostics.progress import phases
 
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
@@ -131,13 +129,14 @@ def check_gradient(
     if loss is not None:
         check_callable("loss", loss, "a function: image (H, W, 4) → scalar, or None")
     engine, parameters = checked_parameters(parameters, "rts.check_gradient")
-    size = check_size(size, 1, None, 1)
+    size = check_pixels(size)
     for name, count in (("samples", samples), ("entries", entries)):
         if not is_count(count):
             raise InputError(f"{name} is {quoted(count)}; expected an integer of at least 1")
     if not (is_real(tolerance) and 0 <= tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
-    check_flag("hessian", hessian)
+    if not isinstance(hessian, (bool, np.bool_)):
+        raise InputError(f"hessian is {quoted(hessian)}; expected True or False")
     if not (progress is None or isinstance(progress, bool)):
         raise InputError(f"progress is {quoted(progress)}; expected True, False, or None for where there is a terminal")
     known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size", "outputs")]

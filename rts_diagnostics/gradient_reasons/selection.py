@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rts.diagnostics.gradient_reasons.disagreeing import why_off
-from rts.diagnostics.gradient_reasons.reasons import Finding, Reason, merged
-from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
-from rts.diagnostics.gradient_reasons.slopes import Number, Slope
-from rts.diagnostics.gradient_reasons.subject import Subject, Touched
-from rts.diagnostics.gradient_reasons.vanishing import (
+from rts_diagnostics.gradient_reasons.disagreeing import why_off
+from rts_diagnostics.gradient_reasons.reasons import Finding, Reason, merged
+from rts_diagnostics.gradient_reasons.shader_steps import why_stepped
+from rts_diagnostics.gradient_reasons.slopes import Number, Slope
+from rts_diagnostics.gradient_reasons.subject import Subject, Touched
+from rts_diagnostics.gradient_reasons.vanishing import (
     is_quiet,
     undetermined,
     why_constant,
@@ -19,7 +19,7 @@ from rts.diagnostics.gradient_reasons.vanishing import (
     why_not_finite,
     why_nothing,
 )
-from rts.diagnostics.progress import Phase
+from rts_diagnostics.progress import Phase
 
 
 def explained(

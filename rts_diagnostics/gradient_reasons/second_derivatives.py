@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import one_line
-from rts.arrays.trees import Tree, leaves
-from rts.diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Number, unit
-from rts.diagnostics.gradient_reasons.subject import Subject
-from rts.diagnostics.progress import Phase
 from rts.errors import InputError, RtsError
+from rts.plugin_api.arrays import Tree, leaves
+from rts_diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Number, unit
+from rts_diagnostics.gradient_reasons.subject import Subject
+from rts_diagnostics.progress import Phase
 
 REACH = 2.0
 """Half the distance of the gradients whose difference is taken, in steps of a slope: pixels, where something moves."""
@@ -124,9 +124,9 @@ def _curvature(subject: Subject, direction: Tree) -> np.ndarray:
     except RtsError:
         raise
     except (RuntimeError, TypeError, NotImplementedError) as error:  # Of torch and of jax.
+        why = textwrap.shorten(str(error) or type(error).__name__, 120, placeholder="...")
         raise InputError(
-            f"hessian=True: {engine.name} cannot differentiate this scene and its loss twice ({one_line(error)}); "
-            f"leave it out"
+            f"hessian=True: {engine.name} cannot differentiate this scene and its loss twice ({why}); leave it out"
         ) from error
 
 

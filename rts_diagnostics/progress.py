@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 
-from rts.terminal import shows_bar
+from rts.plugin_api.checks import shows_bar
 
 Phase = Callable[[str, int], Callable[[], None]]
 """(name of a phase, number of its steps) → a function to call after each step."""

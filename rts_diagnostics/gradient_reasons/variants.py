@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of
-from rts.arrays.trees import Array
-from rts.diagnostics.gradient_reasons.subject import Change
-from rts.registry import instance
-from rts.scene.camera import Camera
-from rts.scene.parts import Part
+from rts import Camera, Part, engine_of
+from rts.plugin_api.arrays import Array
+from rts.tool_api.plugins import check_shader
+from rts_diagnostics.gradient_reasons.subject import Change
 
 CLEAR = 0.5
 """Factor of the alpha and colours of parts that are made transparent."""
@@ -32,7 +30,7 @@ def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
     """The scene with all parts made transparent, by the factor `CLEAR`."""
 
     def through(part: Part) -> Callable[..., Array]:
-        shader = instance("rts.shaders", part.shader)
+        shader = check_shader(part.shader, "the shader")
         return lambda theta, gbuffer, camera: CLEAR * shader(theta, gbuffer, camera)
 
     return [p.replace(shader=through(p)) for p in parts], camera

@@ -7,11 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from rts.arrays.engine_base import Engine
-from rts.arrays.engines import constants, namespace
-from rts.arrays.trees import Array, Tree
-from rts.contracts.records import Splats
-from rts.contracts.splatter import Splatter
+from rts import Engine, Splatter, namespace
+from rts.plugin_api.arrays import Array, Tree, constants
+from rts.plugin_api.records import Splats
 
 STEP_PIXELS = 1.0
 """The motion of the fastest point in the image by a step, pixels."""

@@ -9,17 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import from_numbers, kind_of
-from rts.arrays.engine_base import Engine
-from rts.arrays.engines import engine_of, is_constant, namespace
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import is_real
+from rts import Engine, engine_of, namespace
 from rts.errors import InputError
-from rts.files.srgb import decode_srgb
-from rts.fitting.dependence import differentiable
-from rts.fitting.parameter_names import named_leaves
-from rts.fitting.run import untraceable
+from rts.plugin_api.arrays import Array, Tree, from_numbers, leaves, map_leaves
+from rts.plugin_api.checks import quoted
+from rts.tool_api.parameters import differentiable, is_real, kind_of, named_leaves, untraceable
+from rts.tool_api.pictures import decode_srgb
 
 
 class GradientImage(NamedTuple):
@@ -127,6 +122,6 @@ def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
 
     def leaf(p: Array) -> Array:
         d = next(values)
-        return namespace(p).astype(engine.constant(np.asarray(d), p) if is_constant(d) else d, p.dtype, copy=False)
+        return namespace(p).astype(d if engine.owns(d) else engine.constant(np.asarray(d), p), p.dtype, copy=False)
 
     return map_leaves(leaf, parameters)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.registry import plugin
-from rts.scene.parts import Part
+from rts import Part, plugin
 
 QUAD = ((0, 1, 2), (0, 2, 3))
 """Two triangles that make a face of four corners, listed counter-clockwise."""

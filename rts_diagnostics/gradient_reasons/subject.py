@@ -10,21 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.array_functions import kind_of
-from rts.arrays.engine_base import Engine
-from rts.arrays.engines import is_constant, namespace
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checked_parts import CheckedPart, check_colors, check_scene
-from rts.contracts.checks import check_splatter
-from rts.diagnostics.finite_difference_steps import pixel_step
+from rts import Camera, Engine, Part, namespace, render
 from rts.errors import InputError
-from rts.fitting.parameter_names import named_leaves
-from rts.rendering.image import render
-from rts.sampling.prepared import Prepared
-from rts.scene.camera import Camera
-from rts.scene.parts import Part
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts.results import PreparedParts
+from rts.tool_api.parameters import kind_of, named_leaves
+from rts.tool_api.plugins import check_splatter
+from rts.tool_api.scenes import check_scene
+from rts_diagnostics.finite_difference_steps import pixel_step
 
-Scene = Callable[[Tree], tuple[Part | Sequence[Part] | Prepared, Camera]]
+Scene = Callable[[Tree], tuple[Part | Sequence[Part] | PreparedParts, Camera]]
 Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
 """A function from a scene to a changed one."""
 
@@ -109,7 +104,11 @@ class Subject:
         """
         parts, camera = scene if change is None else change(listed_parts(scene[0]), scene[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
-        check_colors(image.shape[-1] - 1)
+        if image.shape[-1] != 4:
+            raise InputError(
+                f"the scene's shaders give {image.shape[-1] - 1} channels besides alpha; expected 3: look at three of "
+                f"them at a time, by a shader that gives those"
+            )
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
 
     def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:
@@ -293,7 +292,7 @@ class Subject:
                 continue
             changed.append(place)
             slopes = self._gradients.get(place)
-            if is_constant(next(x for x in ends if x is not None)):
+            if not self.engine.owns(next(x for x in ends if x is not None)):
                 constant.append(place)
             elif slopes is None or not any((g * d).any() for g, d in zip(slopes, along, strict=True) if g is not None):
                 cut.append(place)
@@ -302,7 +301,7 @@ class Subject:
                 a, b = (list(_held(getattr(part, name), self._is_array)) for part in pair)
                 if len(a) != len(b) or not all(map(self._alike, a, b)):
                     changed.append(Place(index, name))
-                    constant += [changed[-1]] if is_constant([*a, *b]) else []
+                    constant += [changed[-1]] if not any(map(self.engine.owns, [*a, *b])) else []
         return Touched(changed, constant, cut)
 
     def _is_array(self, x: Any) -> bool:
@@ -311,11 +310,11 @@ class Subject:
     def _alike(self, a: Array, b: Array) -> bool:
         if a is b:
             return True
-        x, y = (np.asarray(v) if is_constant(v) else self.engine.to_numpy(v) for v in (a, b))
+        x, y = (self.engine.to_numpy(v) if self.engine.owns(v) else np.asarray(v) for v in (a, b))
         return x.shape == y.shape and np.array_equal(x, y, equal_nan=x.dtype.kind == y.dtype.kind == "f")
 
     @cached_property
-    def parts(self) -> list[CheckedPart]:
+    def parts(self) -> list[Any]:
         """The checked parts of the scene at the current parameters."""
         scene_parts, camera = self.shown(self.parameters)
         return check_scene(listed_parts(scene_parts), camera)[0]
@@ -347,7 +346,7 @@ class Subject:
 
 def listed_parts(parts: Any) -> list[Part]:
     """The parts in a list; those of `rts.prepare` without their prepared data."""
-    if isinstance(parts, Prepared):
+    if isinstance(parts, PreparedParts):
         parts = parts.parts
     return list(parts) if isinstance(parts, (list, tuple)) else [parts]
 
@@ -378,4 +377,4 @@ def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Ite
 
 def is_floating(x: Array) -> bool:
     """True if an array or a number is of floating point."""
-    return np.asarray(x).dtype.kind == "f" if is_constant(x) else namespace(x).isdtype(x.dtype, "real floating")
+    return isinstance(x, float) or (not isinstance(x, int) and namespace(x).isdtype(x.dtype, "real floating"))

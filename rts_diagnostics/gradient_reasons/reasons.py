@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.files.srgb import decode_srgb
-from rts.fitting.parameter_names import names_in_words
+from rts.tool_api.parameters import names_in_words
+from rts.tool_api.pictures import decode_srgb
 
 KINDS = {
     "constant": ("orange", (255, 150, 0)),
@@ -72,7 +72,7 @@ class Reason(NamedTuple):
     """A reason why derivatives disagree with the truth, or vanish.
 
     Attributes:
-        kind: a key of `rts.diagnostics.gradient_reasons.reasons.KINDS`.
+        kind: a key of `rts_diagnostics.gradient_reasons.reasons.KINDS`.
         parameters: the names of the numbers.
         text: the cause, its share and the remedy, in a plain sentence or two.
         pixels: (H, W) bool, the pixels that show it.

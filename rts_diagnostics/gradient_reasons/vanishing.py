@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from rts.advice.empty_images import out_of_view
-from rts.arrays.trees import leaves, map_leaves
-from rts.contracts.checked_parts import check_scene
-from rts.diagnostics.gradient_reasons import variants
-from rts.diagnostics.gradient_reasons.reasons import Finding
-from rts.diagnostics.gradient_reasons.shader_steps import why_stepped
-from rts.diagnostics.gradient_reasons.slopes import Number
-from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched, listed_parts
-from rts.fitting.dependence import directions_in_words
+from rts.plugin_api.arrays import leaves, map_leaves
+from rts.tool_api.parameters import directions_in_words
+from rts.tool_api.scenes import check_scene, out_of_view
+from rts_diagnostics.gradient_reasons import variants
+from rts_diagnostics.gradient_reasons.reasons import Finding
+from rts_diagnostics.gradient_reasons.shader_steps import why_stepped
+from rts_diagnostics.gradient_reasons.slopes import Number
+from rts_diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched, listed_parts
 
 QUIET = 1e-4
 """The largest change of a pixel by a step that counts as none."""

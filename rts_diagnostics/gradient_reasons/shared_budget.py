@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import quoted
-from rts.arrays.trees import Tree, leaves
-from rts.contracts.checks import is_real
-from rts.diagnostics.gradient_reasons.slopes import Number, differenced, largest_and_random, measured, unit
-from rts.diagnostics.gradient_reasons.subject import Subject
-from rts.diagnostics.progress import Phase
 from rts.errors import InputError
-from rts.fitting.parameter_names import named_leaves
+from rts.plugin_api.arrays import Tree, leaves
+from rts.plugin_api.checks import quoted
+from rts.tool_api.parameters import is_real, named_leaves
+from rts_diagnostics.gradient_reasons.slopes import Number, differenced, largest_and_random, measured, unit
+from rts_diagnostics.gradient_reasons.subject import Subject
+from rts_diagnostics.progress import Phase
 
 FOR_SLOPES = 0.6
 """The share of the budget planned for differences; the rest is for reasons."""
