@@ -17,7 +17,7 @@ from rts.tool_api.scenes import check_scene
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 """Packages of the library whose code is part of the keys."""
-WITHOUT_EFFECT = ("rts/diagnostics", "__pycache__")
+WITHOUT_EFFECT = ("rts/diagnostics", "rts/tool_api", "__pycache__")
 """Folders whose files change no measurement."""
 MOST_LAYERS = 8
 """Layers of hard images where something is translucent."""

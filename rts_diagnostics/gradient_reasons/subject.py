@@ -6,6 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import attrgetter
+from types import FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -298,7 +300,8 @@ class Subject:
                 cut.append(place)
         for index, pair in enumerate(zip(*(listed_parts(parts) for parts, _ in scenes), strict=False)):
             for name in ("shader", "surface") if index < len(self.parts) else ():
-                a, b = (list(_held(getattr(part, name), self._is_array)) for part in pair)
+                of = attrgetter(name)
+                a, b = (list(_held(of(part), self._is_array)) for part in pair)
                 if len(a) != len(b) or not all(map(self._alike, a, b)):
                     changed.append(Place(index, name))
                     constant += [changed[-1]] if not any(map(self.engine.owns, [*a, *b])) else []
@@ -366,13 +369,28 @@ def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Ite
             inside = list(thing.values())
         elif isinstance(thing, (list, tuple)):
             inside = list(thing)
+        elif isinstance(thing, MethodType):
+            inside = [thing.__self__, *_held_by_function(thing.__func__)]
+        elif isinstance(thing, FunctionType):
+            inside = _held_by_function(thing)
+        elif isinstance(thing, partial):
+            inside = [thing.func, thing.args, thing.keywords]
         else:
-            inside = [getattr(thing, name, None) for name in ("__defaults__", "__self__", "__dict__", "func", "args")]
-            for cell in getattr(thing, "__closure__", None) or ():
-                with contextlib.suppress(ValueError):  # A variable that is not assigned yet.
-                    inside.append(cell.cell_contents)
+            try:
+                inside = [vars(thing)]
+            except TypeError:  # It has no attributes of its own.
+                inside = []
         for x in inside:
             yield from _held(x, is_array, depth - 1)
+
+
+def _held_by_function(function: FunctionType) -> list[Any]:
+    """What a function of Python holds in its defaults, its attributes and its closure."""
+    inside: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
+    for cell in function.__closure__ or ():
+        with contextlib.suppress(ValueError):  # A variable that is not assigned yet.
+            inside.append(cell.cell_contents)
+    return inside
 
 
 def is_floating(x: Array) -> bool:
