@@ -133,8 +133,14 @@ def load_own(group: str, name: str) -> Any:
     Args:
         group: such as "rts.testing".
         name: such as "SurfaceConformance".
+
+    Raises:
+        PluginError: the distribution was installed before it registered the name.
     """
-    return distribution(OWN).entry_points.select(group=group)[name].load()
+    found = distribution(OWN).entry_points.select(group=group, name=name)
+    if not found:
+        raise PluginError(f"{group} has no entry point {name!r}; install {OWN} again (pip install .)")
+    return found[name].load()
 
 
 def _kind(group: str) -> str:

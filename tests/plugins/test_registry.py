@@ -240,6 +240,11 @@ def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):
         rts.Bezier  # noqa: B018
 
 
+def test_a_name_that_an_older_installation_lacks_is_refused_by_name():
+    with pytest.raises(rts.errors.PluginError, match="^rts.testing has no entry point 'Nobody'; install rasterize-"):
+        registry.load_own("rts.testing", "Nobody")
+
+
 def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_them():
     loaded = modules_after("import rts\nassert not rts.registry._entry_points\nassert not hasattr(rts, 'regulrizers')")
     assert not {m for m in loaded if m.startswith("rts_surfaces")}
