@@ -24,7 +24,7 @@ import rts
 from benchmarks.report import table
 from benchmarks.timing import in_turn
 from rts import namespace
-from rts.diagnostics.smoothing import low_pass
+from rts_diagnostics.smoothing import low_pass
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 SIZE, FOV = 96, 36.0

@@ -11,7 +11,7 @@ import trimesh
 
 import rts
 from benchmarks.meshes import mesh
-from rts.diagnostics.example_shapes import QUAD
+from rts_diagnostics.example_shapes import QUAD
 from rts_surfaces.implicit.fields import swept_sphere
 
 SIZE = (128, 128)

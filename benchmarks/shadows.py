@@ -24,8 +24,8 @@ from scipy.ndimage import gaussian_filter
 import rts
 from benchmarks.report import table
 from benchmarks.timing import in_turn
-from rts.diagnostics.example_shapes import icosphere
 from rts_compare.environment import environment
+from rts_diagnostics.example_shapes import icosphere
 
 CELLS, POINTS = 128, 400
 HALF = 1.6, 1.2

@@ -27,9 +27,9 @@ import torch
 import rts
 from benchmarks.report import table
 from benchmarks.shadow_scenes import CAMERA, PIXEL, SIZE, Body, Scene, image, intensity, scenes, square
-from rts.diagnostics.smoothing import low_pass
 from rts_compare.environment import environment
 from rts_compare.other_renderers.mitsuba_renderer import flat, mitsuba, positions_of, set_flat
+from rts_diagnostics.smoothing import low_pass
 
 TRUTH_PASS = 256
 """Samples a pixel of one image of a truth; several are averaged, which takes less memory."""

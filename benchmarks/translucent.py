@@ -24,9 +24,9 @@ import torch
 
 import rts
 from benchmarks.report import table
-from rts.diagnostics.example_shapes import icosphere
-from rts.diagnostics.smoothing import low_pass
 from rts_compare.other_renderers.mitsuba_renderer import emitter, flat, mitsuba, positions_of, sensor, set_flat
+from rts_diagnostics.example_shapes import icosphere
+from rts_diagnostics.smoothing import low_pass
 
 CAMERA = rts.Camera.look_at((0.1, 0.2, 6), (0, 0, 0), (0.21, 1, 0), fov_y=30)
 """Edges of upright cards are aslant in its images."""

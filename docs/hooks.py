@@ -55,7 +55,7 @@ def listed(nav):
 def commands():
     """A page in Markdown: each command of `rts`, with its options, as `--help` has them."""
     import typer
-    from rts.cli.main import app
+    from rts_cli.main import app
     from typer.cli import get_docs_for_click
 
     group = typer.main.get_command(app)

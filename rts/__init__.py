@@ -8,7 +8,8 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
-`rts_compare`, `rts.NarrowBand`, `rts.Ndc` and `rts.load_radiance_field`.
+`rts_compare`, `rts.check_gradient` and `rts.gradient_image`, of `rts_diagnostics`, `rts.NarrowBand`, `rts.Ndc` and
+`rts.load_radiance_field`.
 """
 
 # pyright: reportUnsupportedDunderAll=false
@@ -40,8 +41,6 @@ _LATER = {
     "rts.compiling.warmup": "warmup",
     "rts.contracts.residuals": "Residuals",
     "rts.diagnostics.explain": "explain",
-    "rts.diagnostics.gradient_images": "gradient_image",
-    "rts.diagnostics.gradients": "check_gradient",
     "rts.diagnostics.notebooks": "show",
     "rts.diagnostics.profile": "profile",
     "rts.files.images": "load_image save_animation save_image",

@@ -10,7 +10,8 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
-`rts_compare`, `rts.NarrowBand`, `rts.Ndc` and `rts.load_radiance_field`.
+`rts_compare`, `rts.check_gradient` and `rts.gradient_image`, of `rts_diagnostics`, `rts.NarrowBand`, `rts.Ndc` and
+`rts.load_radiance_field`.
 """
 
 import os
@@ -39,8 +40,6 @@ from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
-from rts.diagnostics.gradient_images import gradient_image
-from rts.diagnostics.gradients import check_gradient
 from rts.diagnostics.notebooks import show
 from rts.diagnostics.profile import profile
 from rts.errors import InputError, RtsError
@@ -67,6 +66,8 @@ from rts.scene.parts import Part
 from rts.scene.rigid import rigid
 from rts.scene.view import View
 from rts.views.render_views import render_views
+from rts_diagnostics.gradient_images import gradient_image
+from rts_diagnostics.gradients import check_gradient
 
 __version__: str
 __all__ = [

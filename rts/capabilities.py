@@ -72,18 +72,3 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
     for name in VARIABLES.get(group, ()):
         values[name] = promised(instance, name) if name in PROMISES else getattr(instance, name)
     return values
-
-
-def in_words(values: Mapping[str, Any]) -> str:
-    """Capabilities in a line: names of those that are True, names and values of others; False and None are left out."""
-    words = []
-    for name, value in values.items():
-        shown = name.replace("_", " ")
-        if value is True:
-            words.append(shown)
-        elif isinstance(value, (tuple, list, frozenset)):
-            members = sorted(value) if isinstance(value, frozenset) else value
-            words.append(f"{shown} {' '.join(map(str, members)) or 'nothing'}")
-        elif value is not False and value is not None:
-            words.append(f"{shown} {value}")
-    return ", ".join(words)

@@ -86,4 +86,4 @@ def in_one_line(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-OWN_PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")
+OWN_PACKAGES = ("rts", "rts_backends", "rts_cli", "rts_compare", "rts_diagnostics", "rts_surfaces", "rts_testing")

@@ -127,6 +127,22 @@ def _is_own(entry: EntryPoint) -> bool:
     return entry.dist is not None and entry.dist.name == OWN
 
 
+def load_own(group: str, name: str) -> Any:
+    """What the library's own distribution registers under a name in a group that holds no plugins.
+
+    Args:
+        group: such as "rts.testing".
+        name: such as "SurfaceConformance".
+
+    Raises:
+        PluginError: the distribution was installed before it registered the name.
+    """
+    found = distribution(OWN).entry_points.select(group=group, name=name)
+    if not found:
+        raise PluginError(f"{group} has no entry point {name!r}; install {OWN} again (pip install .)")
+    return found[name].load()
+
+
 def _kind(group: str) -> str:
     return group.removeprefix("rts.").removesuffix("s")
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Part, load, namespace, plugin
-from rts.diagnostics.example_shapes import mesh
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array, Tree
 from rts_compare import scene_shapes
 from rts_compare.moving_scenes import Scene, moving
 from rts_compare.scene_shapes import normalised, rotation_xy, turned
+from rts_diagnostics.example_shapes import mesh
 
 SIZE = (256, 256)
 VARIABLE, FOLDER = "RTS_DATA", Path("../shared/data")

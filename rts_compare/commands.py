@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rts.diagnostics.measuring_api import size_of, supersample_of
+from rts.tool_api.options import size_of, supersample_of
 
 if TYPE_CHECKING:
     from rts_compare.comparison import Comparison

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import Engine, plugin, plugins
-from rts.diagnostics.measuring_api import engine_named
 from rts.errors import InputError, PluginError
 from rts.plugin_api.checks import quoted
+from rts.tool_api.plugins import engine_named
 from rts_compare.pareto_front import LEVELS
 
 FIRST = "torch"

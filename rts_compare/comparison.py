@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Engine
-from rts.diagnostics.measuring_api import output_folder, writing
-from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
+from rts.tool_api.files import output_folder, writing
 from rts_compare.compared_settings import Setting, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
@@ -29,6 +28,7 @@ from rts_compare.pareto_front import Row, best_within, front, marked
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
 from rts_compare.skip_reasons import one_line
 from rts_compare.true_derivatives import SAMPLES
+from rts_diagnostics.progress import Phase, phases
 
 LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4)

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from rts.diagnostics.smoothing import low_pass
+from rts_diagnostics.smoothing import low_pass
 
 LOSSES, LOSS_SCALE = 16, 8.0
 """The number of random losses, and the standard deviation of the Gaussian that smooths their weights, pixels."""

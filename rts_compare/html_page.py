@@ -11,8 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rts.diagnostics.measuring_api import writing
 from rts.errors import InputError, PluginError
+from rts.tool_api.files import writing
 from rts_compare.chart_style import (
     OTHER_COLORS,
     PEER_COLORS,

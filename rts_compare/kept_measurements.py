@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rts.diagnostics.measuring_api import writing
 from rts.errors import InputError
+from rts.tool_api.files import writing
 
 
 class KeptMeasurements:

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from rts import Camera, Part, engine_of, plugin, render, sample
-from rts.diagnostics.measuring_api import check_scene
 from rts.plugin_api.arrays import leaves
 from rts.plugin_api.checks import fingerprint
+from rts.tool_api.scenes import check_scene
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 """Packages of the library whose code is part of the keys."""
-WITHOUT_EFFECT = ("rts/cli", "rts/diagnostics", "rts/testing", "__pycache__")
+WITHOUT_EFFECT = ("rts/diagnostics", "rts/tool_api", "__pycache__")
 """Folders whose files change no measurement."""
 MOST_LAYERS = 8
 """Layers of hard images where something is translucent."""

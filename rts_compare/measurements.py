@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Engine, Part, explain, namespace, render, sample
-from rts.diagnostics.finite_difference_steps import pixel_step
-from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError, RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.compared_settings import Setting
@@ -23,6 +21,8 @@ from rts_compare.moving_scenes import Scene, is_constant, parts_of
 from rts_compare.skip_reasons import TooSlow, limited, one_line
 from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
+from rts_diagnostics.finite_difference_steps import pixel_step
+from rts_diagnostics.smoothing import low_pass
 
 PATIENCE = 8.0
 """Seconds that a sampler may take for a small image, after one of a single pixel that compiles its loops; a slower one

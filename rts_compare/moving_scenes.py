@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, TriangleSurface, engine_of, plugin
-from rts.diagnostics.measuring_api import check_scene
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array, Tree, constants, exemplar, leaves, map_leaves
 from rts.plugin_api.checks import quoted
+from rts.tool_api.scenes import check_scene
 
 SceneFunction = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 

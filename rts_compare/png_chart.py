@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rts.diagnostics.measuring_api import writing
 from rts.errors import PluginError
+from rts.tool_api.files import writing
 from rts_compare.chart_style import (
     PEER_SYMBOL,
     Looks,

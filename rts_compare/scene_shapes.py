@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rts import Camera, Part, load, load_image, plugin
-from rts.diagnostics.example_shapes import QUAD, box, icosphere, unlit
+from rts_diagnostics.example_shapes import QUAD, box, icosphere, unlit
 
 FOV, DISTANCE = 40.0, 3.2
 """The camera's vertical field of view, degrees, and its distance from the origin."""

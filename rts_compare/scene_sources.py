@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, namespace
-from rts.diagnostics.measuring_api import check_scene, default_camera
 from rts.errors import InputError, RtsError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import is_count, quoted
+from rts.tool_api.scenes import check_scene, default_camera
 from rts_compare import builtin_scenes
 from rts_compare.compared_settings import engines
 from rts_compare.moving_scenes import Scene, check_directions, is_constant, moving, parts_of

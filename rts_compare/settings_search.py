@@ -7,11 +7,11 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from rts.diagnostics.progress import Phase
 from rts.errors import InputError, ToleranceWarning, warn
 from rts_compare.compared_settings import Setting
 from rts_compare.interleaved_timing import Calls
 from rts_compare.measurements import TOGETHER, Measurements
+from rts_diagnostics.progress import Phase
 
 LAYERS = (1, 2, 4, 8)
 SUPERSAMPLE = (1, 2, 4)

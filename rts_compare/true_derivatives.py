@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, render_views
-from rts.diagnostics.measuring_api import output_folder, writing
-from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.checks import fingerprint
 from rts.plugin_api.files import cache_folder
+from rts.tool_api.files import output_folder, writing
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.measurement_keys import layers_of, state_key
 from rts_compare.moving_scenes import Scene, parts_of
+from rts_diagnostics.smoothing import low_pass
 
 SAMPLES = 16
 """The square root of the number of points a pixel, on each grid."""

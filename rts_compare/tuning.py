@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Camera, Part, engine_of
-from rts.diagnostics.measuring_api import output_folder
-from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError
 from rts.plugin_api.arrays import Tree, map_leaves
 from rts.plugin_api.checks import check_positive, is_count, quoted
+from rts.tool_api.files import output_folder
 from rts_compare.compared_settings import usable
 from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.measurements import TOGETHER, Measurements
@@ -21,6 +20,7 @@ from rts_compare.moving_scenes import Scene, SceneFunction, parts_of
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
 from rts_compare.settings_search import SUPERSAMPLE, Search
 from rts_compare.true_derivatives import SAMPLES
+from rts_diagnostics.progress import Phase, phases
 
 TRUTH_SAMPLES = (4, 8, SAMPLES)
 """`truth_samples` to choose from: the next number where the error of the true derivative itself is too large."""

@@ -10,8 +10,8 @@ import numpy as np
 import rts
 from benchmarks.accuracy.scenes import DISTANCE, Scene, motion, pixel, turn
 from benchmarks.meshes import rotation_xy
-from rts.diagnostics.example_shapes import QUAD, box, unlit
 from rts_compare import scene_shapes
+from rts_diagnostics.example_shapes import QUAD, box, unlit
 
 PLANE_COLORS = (0.9, 0.5, 0.2), (0.2, 0.5, 0.9)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.accuracy import scenes
 from benchmarks.accuracy.methods import CASES, name_of
-from rts.diagnostics.smoothing import low_pass
+from rts_diagnostics.smoothing import low_pass
 
 COLUMNS = {
     "single, K = 1": "single, K = 1",

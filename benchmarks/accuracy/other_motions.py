@@ -18,10 +18,10 @@ from benchmarks.accuracy.scenes import DISTANCE, grids, pixel
 from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
 from benchmarks.report import table
-from rts.diagnostics.example_shapes import icosphere
-from rts.diagnostics.smoothing import low_pass
 from rts_compare.builtin_scenes import VASE_HEIGHTS, VASE_RADII
 from rts_compare.derivative_scores import all_scores
+from rts_diagnostics.example_shapes import icosphere
+from rts_diagnostics.smoothing import low_pass
 
 SIZE, POINTS = 256, 8
 """Pixels, and points of a pixel along x and y in each of the truth's two grids."""

@@ -17,11 +17,11 @@ import numpy as np
 import rts
 from benchmarks.camera import DISTANCE, camera, regular_grid
 from benchmarks.meshes import DATA, mesh, rotation_xy
-from rts.diagnostics.example_shapes import QUAD, box, icosphere, unlit
 from rts.plugin_api.arrays import constants, exemplar
 from rts_compare import moving_scenes, scene_shapes
 from rts_compare.scene_shapes import CARD_DEPTH, grid, on_screen, pixel, rectangle
 from rts_compare.true_derivatives import SAMPLES, Truth, area_image, lattice, truth
+from rts_diagnostics.example_shapes import QUAD, box, icosphere, unlit
 
 SIZE = 256
 MOTION = "motion"

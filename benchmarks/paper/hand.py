@@ -27,10 +27,10 @@ import rts
 from benchmarks.camera import regular_grid
 from benchmarks.meshes import DATA
 from benchmarks.report import table
-from rts.diagnostics.example_shapes import QUAD
 from rts.files.srgb import encode_srgb
 from rts_compare.failures import table_columns as failures
 from rts_compare.kept_measurements import KeptMeasurements
+from rts_diagnostics.example_shapes import QUAD
 
 PHOTOGRAPHS = ("IMG-1842.jpg", "IMG-1843.jpg", "IMG-1844.jpg")
 METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "edges")}

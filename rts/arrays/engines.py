@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import repeat
 from typing import Any, NamedTuple, TypeVar
 
@@ -49,6 +50,23 @@ def engine_named(name: str) -> Engine:
         check_members(type(engine))
         _ENGINES[name] = engine
     return _ENGINES[name]
+
+
+@contextlib.contextmanager
+def owning(engine: Engine) -> Iterator[None]:
+    """Context in which arrays like those of an engine are its own, though it is not registered."""
+    kind = type(engine.constant(np.ones(1)))
+    if kind is np.ndarray:
+        yield
+        return
+    before, OWNERS[kind] = OWNERS.get(kind), engine
+    try:
+        yield
+    finally:
+        if before is None:
+            del OWNERS[kind]
+        else:
+            OWNERS[kind] = before
 
 
 def _owner(x: Any) -> Engine:

@@ -152,15 +152,6 @@ def check_channels(parts: Sequence[CheckedPart]) -> int:
     return count
 
 
-def check_colors(channels: int) -> None:
-    """Refuse another number of channels than three, where an image of colours is needed."""
-    if channels != 3:
-        raise InputError(
-            f"the scene's shaders give {channels} channels besides alpha; expected 3: look at three of them at a "
-            f"time, by a shader that gives those"
-        )
-
-
 def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
     """Refuse changes of a prepared part: of fields that are fixed, or with an index outside of `count` parts."""
     if "surface" in changes:

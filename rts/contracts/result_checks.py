@@ -17,13 +17,13 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
 
-WIDTHS = {"position": 3, "normal": 3, "face_normal": 3, "tangent": 4, "uv": 2, "uv_footprint": 4}
+ATTRIBUTE_WIDTHS = {"position": 3, "normal": 3, "face_normal": 3, "tangent": 4, "uv": 2, "uv_footprint": 4}
 """Columns of attributes that the library itself reads."""
 
 
 def check_attribute(surface: Any, count: int, name: str, value: Any) -> None:
     """Refuse an attribute of a surface's G-buffer that has no row for each of `count` samples, or not its columns."""
-    shape, width = getattr(value, "shape", ()), WIDTHS.get(name)
+    shape, width = getattr(value, "shape", ()), ATTRIBUTE_WIDTHS.get(name)
     if len(shape) == 2 and shape[0] == count and (width is None or (shape[1] == width and floating_bits(value))):
         return
     expected = f"({count}, {'any number' if width is None else width})"

@@ -15,7 +15,7 @@ from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.shader import FunctionShader, Shader
-from rts.diagnostics.gradient_reasons.shader_steps import REMEDY, STEP, steps_inside
+from rts.diagnostics.shader_steps import STEP_CAUSE, STEP_REMEDY, steps_inside
 from rts.fitting.targets import BRIGHTEST, largest
 from rts.registry import name_of
 from rts.rendering.arguments import Layers, SplatterLike
@@ -167,7 +167,7 @@ def _remarks(part: CheckedPart, camera: Camera, watched: _Watched | None) -> Ite
     if isinstance(part.shader, FunctionShader) and not hasattr(part.shader.function, "opaque"):
         yield NO_PROMISE
     if watched is not None and watched.steps:
-        yield f"its colours step inside the surface, {STEP}; {REMEDY}"
+        yield f"its colours step inside the surface, {STEP_CAUSE}; {STEP_REMEDY}"
 
 
 def _count(samples: Samples) -> int:

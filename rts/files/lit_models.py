@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.errors import InputError
 from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_cameras import read_cameras
 from rts.files.gltf_lights import read_lights
@@ -20,7 +19,6 @@ from rts.files.models import check_exists, load, parts_of
 from rts.files.moving_models import EXTENSIONS
 from rts.files.paths import beside
 from rts.scene.camera import Camera
-from rts.scene.model import Model
 from rts.scene.parts import Part
 
 
@@ -73,23 +71,3 @@ def load_lit(
         gltf.warn_of_notes()
     warn_once(path, notes)
     return model
-
-
-def chosen_camera(model: LitModel | Model, wanted: str, path: Path) -> Camera:
-    """The camera of a model by its name or its number, from 0 on; the first one for "".
-
-    Raises:
-        InputError: there is no such camera, or several have this name.
-    """
-    names = model.camera_names
-    if names and not wanted:
-        return model.cameras[0]
-    numbers = [str(i) for i in range(len(names))]
-    if names.count(wanted) == 1:
-        return model.cameras[names.index(wanted)]
-    if wanted in numbers:
-        return model.cameras[numbers.index(wanted)]
-    if not names:
-        raise InputError(f"{path} has no camera; expected angles, such as --camera 30,20")
-    there = ", ".join(f"{i} ({name!r})" if name else i for i, name in zip(numbers, names, strict=True))
-    raise InputError(f"{wanted!r} is no camera of {path}; expected the name of one, or its number: {there}")

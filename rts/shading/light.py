@@ -45,9 +45,8 @@ from rts.shading.environment import blurs, prefiltered, reflected
 from rts.shading.spherical_harmonics import COUNTS, irradiance, radiance
 from rts.shading.theta_entries import check_entry
 
-AMBIENT, COLOR = 0.2, 0.8
-DIRECTION = (-0.3, 0.5, 0.81)
-"""The default direction, in camera space."""
+DEFAULT_LIGHT = {"ambient": 0.2, "color": 0.8, "direction": (-0.3, 0.5, 0.81)}
+"""Light from all around and a distant light, where θ has none; the direction is in camera space."""
 CONE = (0.0, math.pi / 4)
 WIDEST = math.pi + 1e-6
 """The largest angle of a cone, with room for rounding."""
@@ -149,7 +148,7 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
         raise InputError(f"theta['light'] is a {type(entries).__name__}; expected a dict of {', '.join(ENTRIES)}")
     check_light(entries)
     usual = not any(name in entries for name in FURTHER)
-    light = Light(ambient=entries.get("ambient", AMBIENT if usual else None), sh=entries.get("sh"))
+    light = Light(ambient=entries.get("ambient", DEFAULT_LIGHT["ambient"] if usual else None), sh=entries.get("sh"))
     if usual or "direction" in entries or "color" in entries:
         if "direction" in entries:
             vectors = value_of(entries["direction"])
@@ -159,8 +158,8 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
                 )
             directions = _separate_vectors(unit(entries["direction"]))
         else:
-            directions = [camera.to_world(DIRECTION)]
-        light.distant = _paired("direction", directions, "color", entries, COLOR)
+            directions = [camera.to_world(DEFAULT_LIGHT["direction"])]
+        light.distant = _paired("direction", directions, "color", entries, DEFAULT_LIGHT["color"])
     if "position" in entries:
         light.points = _points(entries)
     elif given := [name for name in ("intensity", "axis", "cone") if name in entries]:

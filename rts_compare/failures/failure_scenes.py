@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Part, engine_of, rigid
-from rts.diagnostics import example_shapes
-from rts.diagnostics.example_shapes import QUAD, unlit
 from rts.plugin_api.arrays import Tree
 from rts_compare import scene_shapes
 from rts_compare.builtin_scenes import data_file, read_mesh
 from rts_compare.moving_scenes import Scene, parts_of
 from rts_compare.scene_shapes import CARD_DEPTH, DISTANCE, on_screen, pixel, rectangle
+from rts_diagnostics import example_shapes
+from rts_diagnostics.example_shapes import QUAD, unlit
 
 SIZE = (96, 96)
 SMALL = (64, 64)

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Part, fit, plugin, render, rigid
-from rts.diagnostics.measuring_api import engine_named
-from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array
+from rts.tool_api.plugins import engine_named
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.failures import failure_scenes
 from rts_compare.failures.method_renderers import Own, Unable, quiet
@@ -22,6 +21,7 @@ from rts_compare.failures.table_cells import Context, Outcome, cannot, graded
 from rts_compare.failures.table_columns import Method
 from rts_compare.moving_scenes import parts_of
 from rts_compare.true_derivatives import area_image, lattice
+from rts_diagnostics.smoothing import low_pass
 
 COUNT, BOUNDS = 16, ((-1.0,) * 3, (1.0,) * 3)
 COLOR = np.array([0.9, 0.6, 0.3], np.float32)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from rts import Engine, engine_of, render
-from rts.diagnostics.measuring_api import engine_named
 from rts.errors import RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts.tool_api.plugins import engine_named
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.failures.table_columns import Method
 from rts_compare.moving_scenes import Scene, parts_of

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.smoothing import low_pass
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.failures.method_renderers import Unable, quiet, renderer, shifted
 from rts_compare.failures.table_cells import Context, Outcome, cannot, graded
@@ -15,6 +14,7 @@ from rts_compare.failures.table_columns import Method
 from rts_compare.moving_scenes import Scene, parts_of
 from rts_compare.other_renderers.renderer_input import renderer_input
 from rts_compare.true_derivatives import area_image, lattice, truth
+from rts_diagnostics.smoothing import low_pass
 
 ERRORS = 0.2, 0.5
 """The largest error of a derivative image that is ok, and degraded."""

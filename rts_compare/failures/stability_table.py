@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.measuring_api import output_folder, writing
-from rts.diagnostics.progress import phases
 from rts.errors import InputError
 from rts.plugin_api.checks import is_count, quoted
+from rts.tool_api.files import output_folder, writing
 from rts_compare.environment import environment
 from rts_compare.failures.table_cells import Context, Outcome, Row, cannot
 from rts_compare.failures.table_columns import METHODS, Method
 from rts_compare.failures.table_rows import ROWS
 from rts_compare.kept_measurements import KeptMeasurements
+from rts_diagnostics.progress import phases
 
 MARKS = {"ok": "", "degraded": "~ ", "failed": "✗ ", "cannot": "–"}
 PACKAGES = ("rasterize-then-splat", "numpy", "torch", "deodr", "mitsuba")

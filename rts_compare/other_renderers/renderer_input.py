@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, plugin
-from rts.diagnostics.measuring_api import check_scene
 from rts.errors import InputError
 from rts.plugin_api.arrays import map_leaves
+from rts.tool_api.scenes import check_scene
 from rts_compare.moving_scenes import Scene
 
 EDGE = 4.0

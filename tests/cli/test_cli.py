@@ -14,13 +14,13 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import rts
-from rts.cli import demo, tried_versions
-from rts.cli import main as cli
-from rts.cli import pose_fit as pose
 from rts.errors import InputError, PluginError
 from rts.files import lit_models
 from rts.files.srgb import decode_srgb
 from rts.scene.default_camera import Bounds, bounds_of, orbit
+from rts_cli import demo, plugin_tables, tried_versions
+from rts_cli import main as cli
+from rts_cli import pose_fit as pose
 
 pytestmark = pytest.mark.files
 
@@ -68,7 +68,7 @@ def test_version():
 
 def test_the_installed_program_reports_an_error_in_one_line_and_the_traceback_on_request():
     def installed(*arguments):
-        code = "import sys; from rts.cli.main import main; sys.argv[0] = 'rts'; main()"
+        code = "import sys; from rts_cli.main import main; sys.argv[0] = 'rts'; main()"
         return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
 
     short = installed("render", "gone.obj")
@@ -174,12 +174,12 @@ def test_plugins_lists_each_plugin_and_why_one_does_not_load(monkeypatch):
         n for group in ("engines", "surfaces", "samplers", "shaders", "splatters") for n in rts.plugins(group)
     ):
         assert f"│ {name} │" in output
-    broken = [rts.registry.PluginInfo("rts.samplers", "odd", "odd 1.0", "needs [odd]: pip install odd")]
-    monkeypatch.setattr(rts.registry, "survey", lambda: broken)
+    broken = [rts.results.PluginInfo("rts.samplers", "odd", "odd 1.0", "needs [odd]: pip install odd")]
+    monkeypatch.setattr(plugin_tables, "survey", lambda: broken)
     assert "│ samplers │ odd │ odd 1.0 │ needs [odd]: pip install odd │ │" in succeed("plugins")
     able = {"triangles": True, "rays": False, "layers": 1, "reads": ("uv", "normal"), "reach": None}
-    partly = [rts.registry.PluginInfo("rts.samplers", "odd", "odd 1.0", None, ("dd",), "odd[odd]", able)]
-    monkeypatch.setattr(rts.registry, "survey", lambda: partly)
+    partly = [rts.results.PluginInfo("rts.samplers", "odd", "odd 1.0", None, ("dd",), "odd[odd]", able)]
+    monkeypatch.setattr(plugin_tables, "survey", lambda: partly)
     ready = "ready, but without dd: pip install 'odd[odd]'"
     assert f"│ {ready} │ triangles, layers 1, reads uv normal │" in succeed("plugins")
 
@@ -436,7 +436,7 @@ def test_names_that_cannot_be_written_are_refused_before_any_work(model, tmp_pat
     def work(*_, **__):
         raise AssertionError
 
-    readers, fits = ("rts.load", "rts.files.lit_models.load"), ("rts.cli.pose_fit.fit_pose", "rts.cli.demo.fit_pose")
+    readers, fits = ("rts.load", "rts.files.lit_models.load"), ("rts_cli.pose_fit.fit_pose", "rts_cli.demo.fit_pose")
     for name in ("rts.render", *readers, *fits):
         monkeypatch.setattr(name, work)
     (tmp_path / "file").write_text("")

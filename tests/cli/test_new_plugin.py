@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from rts.cli.main import app
-from rts.cli.new_plugin import KINDS, PLACES, TRIANGLES
+from rts_cli.main import app
+from rts_cli.new_plugin import KINDS, PLACES, TRIANGLES
 
 pytestmark = pytest.mark.plugins
 
@@ -75,9 +75,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path, monkeypa
 
 
 def test_every_template_has_a_place_and_is_in_the_wheel():
-    templates = ROOT / "rts/cli/templates"
+    templates = ROOT / "rts_cli/templates"
     there = {str(p.relative_to(templates)) for p in templates.rglob("*") if p.is_file()}
     assert there == {place.format(template=kind) for place in PLACES for kind in (*KINDS, TRIANGLES)}
-    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["rts"]
-    packed = {p for pattern in data for p in (ROOT / "rts").glob(pattern)}
-    assert {p for p in (ROOT / "rts/cli/templates").rglob("*") if p.is_file()} <= packed
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["rts_cli"]
+    packed = {p for pattern in data for p in (ROOT / "rts_cli").glob(pattern)}
+    assert {p for p in (ROOT / "rts_cli/templates").rglob("*") if p.is_file()} <= packed

@@ -12,7 +12,7 @@ from trimesh.exchange.gltf import export_gltf
 from typer.testing import CliRunner
 
 import rts
-from rts.cli import main as cli
+from rts_cli import main as cli
 
 pytestmark = pytest.mark.files
 

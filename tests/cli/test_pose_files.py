@@ -9,11 +9,11 @@ from helpers import crooked_block
 from typer.testing import CliRunner
 
 import rts
-from rts.cli import main as cli
-from rts.cli.pose_file import ModelPose, posed, read_pose
-from rts.cli.pose_verdict import intersection_over_union, judged, touches_border, unlike_a_mask
 from rts.errors import InputError
 from rts.scene.default_camera import bounds_of, orbit
+from rts_cli import main as cli
+from rts_cli.pose_file import ModelPose, posed, read_pose
+from rts_cli.pose_verdict import intersection_over_union, judged, touches_border, unlike_a_mask
 
 pytestmark = pytest.mark.files
 

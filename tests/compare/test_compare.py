@@ -735,7 +735,7 @@ class TestMisuse:
 def run(*arguments):
     from typer.testing import CliRunner
 
-    from rts.cli import main
+    from rts_cli import main
 
     result = CliRunner().invoke(main.app, [str(a) for a in arguments])
     return result.exit_code, " ".join(result.output.split())

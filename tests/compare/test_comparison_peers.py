@@ -10,11 +10,11 @@ from helpers import icosphere
 from scipy.ndimage import gaussian_filter
 
 import rts
-from rts.diagnostics.smoothing import low_pass
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.moving_scenes import moving
 from rts_compare.other_renderers.installed_renderers import peers
 from rts_compare.other_renderers.mitsuba_renderer import emitter, flat, mitsuba, positions_of, set_flat
+from rts_diagnostics.smoothing import low_pass
 
 pytestmark = pytest.mark.rendering
 

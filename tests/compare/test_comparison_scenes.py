@@ -6,11 +6,11 @@ from helpers import derivative, quick
 
 import rts
 from rts.arrays.engines import engine_named
-from rts.diagnostics.example_shapes import QUAD, unlit
 from rts.errors import InputError, PluginError
 from rts_compare import scene_shapes
 from rts_compare.builtin_scenes import BUILTIN, builtin, names
 from rts_compare.moving_scenes import MODES, check_directions, moving
+from rts_diagnostics.example_shapes import QUAD, unlit
 
 pytestmark = pytest.mark.rendering
 

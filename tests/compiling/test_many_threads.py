@@ -16,7 +16,7 @@ import rts
 from rts.arrays.engines import constants, engine_named
 from rts.arrays.trees import leaves, map_leaves
 from rts.errors import EmptyImageWarning, RtsError
-from rts.testing.compatibility import CAMERA, SIZE, example, single
+from rts_testing.compatibility import CAMERA, SIZE, example, single
 
 pytestmark = pytest.mark.core
 

@@ -5,7 +5,7 @@ import pytest
 from helpers import DIFFERENTIABLE, TORCH, arrays, quad, to_numpy
 
 import rts
-from rts.diagnostics import finite_difference_steps, gradients
+from rts_diagnostics import finite_difference_steps, gradients
 
 pytestmark = pytest.mark.rendering
 

@@ -10,9 +10,9 @@ from helpers import arrays, icosphere, quad, quick
 import rts
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import leaves
-from rts.diagnostics.gradient_reasons import disagreeing, shared_budget
-from rts.diagnostics.gradient_reasons.reasons import KINDS
-from rts.diagnostics.gradient_reasons.subject import Subject
+from rts_diagnostics.gradient_reasons import disagreeing, shared_budget
+from rts_diagnostics.gradient_reasons.reasons import KINDS
+from rts_diagnostics.gradient_reasons.subject import Subject
 
 pytestmark = pytest.mark.rendering
 

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 import rts
 from rts import InputError
-from rts.cli.clip_frames import frames_of
-from rts.cli.main import app
 from rts.errors import FileWarning
 from rts.results import Channel, Clip
+from rts_cli.clip_frames import frames_of
+from rts_cli.main import app
 
 pytestmark = pytest.mark.files
 

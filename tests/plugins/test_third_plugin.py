@@ -11,8 +11,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from rts import registry
-from rts.cli.main import app
 from rts.testing import SamplerConformance, ShaderConformance, SurfaceConformance
+from rts_cli.main import app
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "third_plugin"))  # Nothing installs it.
 

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import rts
 from rts import registry
-from rts.cli.demo import knot
-from rts.cli.main import app
+from rts_cli.demo import knot
+from rts_cli.main import app
 
 pytestmark = pytest.mark.docs
 

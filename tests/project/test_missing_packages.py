@@ -15,7 +15,7 @@ import rts
 from rts import InputError, Part
 from rts.errors import PluginError
 from rts.scene.camera import perspective
-from rts.testing.compatibility import APRON
+from rts_testing.compatibility import APRON
 
 pytestmark = pytest.mark.core
 
@@ -133,7 +133,7 @@ def test_without_the_packages_of_the_command_the_library_works_and_the_command_s
     printed = without(
         package,
         """
-        from rts.__main__ import main
+        from rts_cli.__main__ import main
         try:
             main()
         except SystemExit as stop:
@@ -155,8 +155,9 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         "matplotlib",
         """
         from pathlib import Path
-        from rts.cli import main, pose_report
-        assert pose_report._plot(Path("convergence.png"), [1.0, 0.1], [2]) == []
+        from rts_cli import main, pose_report
+        fit = rts.results.Fit(None, 0.1, [1.0, 0.1], 2, "", 0.0, (2,), [])
+        assert pose_report._plot(Path("convergence.png"), fit) == []
         main._say_skipped_plot([])
         """,
     )
@@ -403,7 +404,7 @@ def test_a_folder_named_rts_does_not_hide_an_editable_install(tmp_path):
     pytest.importorskip("setuptools", minversion="77")
     clone, site, beside = (tmp_path / name for name in ("clone", "site", "beside"))
     root = Path(__file__).resolve().parents[2]
-    for name in ("rts", "rts_backends", "rts_compare", "rts_surfaces"):
+    for name in ("rts", *(path.name for path in root.glob("rts_*") if path.is_dir())):
         (clone / name).mkdir(parents=True)
         (clone / name / "__init__.py").write_text('__version__ = "1.2.3"\n')
     for name in ("pyproject.toml", "README.md", "LICENSE"):

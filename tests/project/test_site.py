@@ -55,8 +55,8 @@ def public_names():
         own = [name for name, value in vars(found).items() if getattr(value, "__module__", None) == module]
         names = getattr(found, "__all__", [name for name in own if name not in OF_THE_LIBRARY])
         yield from (f"{module}.{name}" for name in names)
-    for path in sorted((ROOT / "rts/plugin_api").glob("[a-z]*.py")):
-        module = f"rts.plugin_api.{path.stem}"
+    for path in sorted((ROOT / "rts").glob("*_api/[a-z]*.py")):
+        module = f"rts.{path.parent.name}.{path.stem}"
         yield from (f"{module}.{name}" for name in import_module(module).__all__)
 
 
@@ -107,7 +107,7 @@ def test_the_navigation_has_every_page():
 
 def messages():
     """The literal text of each string in the library; holes of f-strings are left out."""
-    for package in ("rts", "rts_backends", "rts_surfaces", "rts_compare"):
+    for package in ("rts", "rts_backends", "rts_surfaces", "rts_cli", "rts_diagnostics", "rts_testing", "rts_compare"):
         for path in (ROOT / package).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.JoinedStr):

@@ -19,7 +19,7 @@ from benchmarks.defects import planted, run
 pytestmark = pytest.mark.core
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")
+PACKAGES = ("rts", *sorted(path.name for path in ROOT.glob("rts_*") if path.is_dir()))
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for package in PACKAGES
@@ -74,7 +74,8 @@ def test_rooms_import_from_those_above_them():
             assert all(order[other] <= order[rest.partition(".")[0]] for other in others), name
 
 
-def test_the_core_never_imports_a_plugin_package():
+def test_the_core_never_imports_a_package_beside_it():
+    assert len(PACKAGES) > 4
     for name, path in FILES.items():
         if name.partition(".")[0] == "rts":
             assert not {n for n in imports(path, types=True) if n.partition(".")[0] != "rts"}, name
@@ -123,23 +124,19 @@ def defined(path):
     return [name for name in names if not name.startswith("_")]
 
 
-def test_measuring_imports_public_names_alone():
-    modules = [
-        name for name in FILES if re.fullmatch(r"rts\.diagnostics\.\w+|rts\.(errors|regularizers|testing)", name)
-    ]
-    public = {
-        "rts": [*rts.__all__, "errors"],
-        "rts.diagnostics": [name.rpartition(".")[2] for name in modules],
-        "rts.shading": import_module("rts.shading").__all__,
-        **toolkit(),
-    }
-    public |= {name: defined(FILES[name]) for name in modules}
-    public["rts.diagnostics.measuring_api"] = import_module("rts.diagnostics.measuring_api").__all__
-    own = [path for name, path in FILES.items() if name.startswith("rts_compare")]
-    assert len(own) > 30
-    for path in own:
-        assert not private(path, public), path
-    public["rts"] = [*rts.__all__, "errors", "regularizers", "shadows", *rts.registry.built_in_attributes()]
+def test_tools_import_public_names_alone():
+    tools = [name for name in FILES if name.startswith("rts.tool_api.")]
+    listed = (*tools, "rts.regularizers", "rts.results", "rts.shading", "rts.shadows", "rts.testing")
+    public = {"rts.errors": defined(FILES["rts.errors"])} | toolkit()
+    public |= {name: import_module(name).__all__ for name in listed}
+    public["rts"] = [*rts.__all__, *rts._PLACES, *rts._MODULES, "__version__", "errors"]
+    public["rts"] += rts.registry.built_in_attributes()
+    assert sum(len(public[name]) for name in tools) <= 47
+    for package in ("rts_cli", "rts_compare", "rts_diagnostics", "rts_testing"):
+        own = [path for name, path in FILES.items() if name.startswith(package)]
+        assert len(own) > 10
+        for path in own:
+            assert not private(path, public), path
     assert len(APPS) > 10
     for path in APPS.values():
         assert not private(path, public), path

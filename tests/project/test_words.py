@@ -29,13 +29,13 @@ PAGES = [
     )
     if path not in PAST
 ]
-PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")
+PACKAGES = ("rts", *sorted(path.name for path in ROOT.glob("rts_*") if path.is_dir()))
 FOLDERS = (*PACKAGES, "apps", "benchmarks", "docs", "tests")
 FILES = [str(p.relative_to(ROOT)) for f in (*FOLDERS, ".github") for p in (ROOT / f).rglob("*") if p.is_file()]
 RECORDS = "rts.contracts.records"
 MODULES = (
     *("rts.errors", "rts.regularizers", "rts.results", "rts.shadows", "rts.splatting", "rts.testing", "rts_compare"),
-    *(f"rts.plugin_api.{path.stem}" for path in (ROOT / "rts/plugin_api").glob("[a-z]*.py")),
+    *(f"rts.{path.parent.name}.{path.stem}" for path in (ROOT / "rts").glob("*_api/[a-z]*.py")),
 )
 NAME = re.compile(r"(?<![\w./…-])[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*(?![\w/])")
 

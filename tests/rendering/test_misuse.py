@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import rts
-import rts.diagnostics
 import rts_compare
 from rts import Camera
 from rts.plugin_api.operations import combine, gradient
@@ -397,7 +396,7 @@ def test_a_wrong_value_is_one_line_or_works(call, tmp_path, monkeypatch):
 
 def public():
     """Names that users call."""
-    modules = (rts, rts.regularizers, rts.diagnostics, rts_compare)
+    modules = (rts, rts.regularizers, rts_compare)
     names = {name: getattr(module, name) for module in modules for name in module.__all__}
     names |= {name: getattr(rts, name) for name in rts.registry.built_in_attributes()}
     names |= {

@@ -27,7 +27,7 @@ from helpers import (
 import rts
 from rts import Camera, Part
 from rts.shading.shaders import Lambert, Textured
-from rts.testing.compatibility import APRON
+from rts_testing.compatibility import APRON
 
 pytestmark = pytest.mark.rendering
 

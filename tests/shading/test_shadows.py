@@ -10,11 +10,11 @@ import torch
 
 import rts
 from rts import shadows
-from rts.diagnostics.example_shapes import box, icosphere
 from rts.operations.coverage import COVERAGE
 from rts.operations.depth_limits import FAR, NEARER
 from rts.operations.depth_planes import PLANES
 from rts.testing import OperationConformance
+from rts_diagnostics.example_shapes import box, icosphere
 
 pytestmark = pytest.mark.rendering
 

@@ -5,7 +5,7 @@ import pytest
 from helpers import icosphere
 
 import rts
-from rts.diagnostics.smoothing import low_pass
+from rts_diagnostics.smoothing import low_pass
 
 torch = pytest.importorskip("torch")
 forward = pytest.importorskip("torch.autograd.forward_ad")

@@ -8,8 +8,8 @@ from seen import CAMERA, SIZE, VIEWS, WEIGHTS, rays_spread, stages
 
 import rts
 from rts.testing import SurfaceConformance
-from rts.testing.compatibility import APRON
-from rts.testing.derivatives import claim_slope, directions
+from rts_testing.compatibility import APRON
+from rts_testing.derivatives import claim_slope, directions
 
 pytestmark = pytest.mark.sampling
 

@@ -16,8 +16,8 @@ from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 from rts.sampling import layer_order
 from rts.testing import OperationConformance
-from rts.testing.compatibility import APRON
 from rts_surfaces.patches import bicubic, tile_triangles
+from rts_testing.compatibility import APRON
 
 pytestmark = pytest.mark.sampling
 

@@ -8,9 +8,9 @@ import rts
 from rts import Camera, InputError, Part
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.testing.compatibility import APRON
 from rts_surfaces.patches import tile_triangles
 from rts_surfaces.patches.bspline import extraction
+from rts_testing.compatibility import APRON
 
 pytestmark = pytest.mark.sampling
 

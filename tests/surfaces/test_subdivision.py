@@ -20,9 +20,9 @@ try:
 except rts.errors.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
-from rts.testing.compatibility import APRON  # noqa: E402
 from rts_surfaces.subdivision.binding import UV, Limit, Rules  # noqa: E402
 from rts_surfaces.subdivision.cage_checks import checked_cage  # noqa: E402
+from rts_testing.compatibility import APRON  # noqa: E402
 
 SIZE = (60, 80)
 CAMERA = Camera.look_at((1.5, 1.8, 4.0), (0, 0, 0), fov_y=40)

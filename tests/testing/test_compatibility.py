@@ -10,10 +10,11 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import rts
-from rts.cli.main import app
-from rts.cli.plugin_tables import print_matrix
-from rts.testing import compatibility
+from rts_cli import plugin_tables
+from rts_cli.main import app
+from rts_cli.plugin_tables import print_matrix
 from rts_surfaces.implicit.fields import swept_sphere
+from rts_testing import compatibility
 
 pytestmark = pytest.mark.plugins
 
@@ -96,10 +97,11 @@ def test_the_matrix_names_each_pair_and_why_one_does_not_work(monkeypatch):
             raise KeyError("lost")
 
     found = {"mesh": rts.plugin("surfaces", "mesh"), "bare": Bare, "broken": Broken}
-    plugin, plugins = rts.registry.plugin, rts.registry.plugins
+    plugin, plugins = rts.plugin, rts.plugins
     names = {"rts.engines": ["numpy"], "rts.samplers": ["raster", "rays"], "rts.surfaces": list(found)}
-    monkeypatch.setattr(rts.registry, "plugins", lambda group: names.get(group) or plugins(group))
-    monkeypatch.setattr(rts.registry, "plugin", lambda group, name: found.get(name) or plugin(group, name))
+    for place in (compatibility, plugin_tables):
+        monkeypatch.setattr(place, "plugins", lambda group: names.get(group) or plugins(group))
+    monkeypatch.setattr(compatibility, "plugin", lambda group, name: found.get(name) or plugin(group, name))
     monkeypatch.setenv("COLUMNS", "300")
     done = CliRunner().invoke(app, ["plugins", "--matrix"])
     assert done.exit_code == 0

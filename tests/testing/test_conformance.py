@@ -33,12 +33,9 @@ from rts.testing import (
     ShaderConformance,
     SplatterConformance,
     SurfaceConformance,
-    compatibility,
-    scenes,
-    shaders,
-    splatters,
 )
-from rts.testing.engine_examples import numbers
+from rts_testing import compatibility, scenes, shaders, splatters
+from rts_testing.engine_examples import numbers
 
 pytestmark = pytest.mark.plugins
 
@@ -1160,8 +1157,8 @@ def test_only_subclasses_are_collected(kit):
 
 
 def test_the_kit_is_loaded_by_nothing_but_its_own_import():
-    names = "('pytest', '_pytest', 'rts.testing')"
-    code = f"import sys, rts, rts.cli.main; print([m for m in sys.modules if m.startswith({names})])"
+    names = "('pytest', '_pytest', 'rts.testing', 'rts_testing')"
+    code = f"import sys, rts, rts_cli.main; print([m for m in sys.modules if m.startswith({names})])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
     assert not [e for e in entry_points(group="pytest11") if e.dist and e.dist.name == "rasterize-then-splat"]

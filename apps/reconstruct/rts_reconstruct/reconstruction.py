@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import rts
-from rts.diagnostics.measuring_api import output_folder, writing
+from rts.tool_api.files import output_folder, writing
 from rts_reconstruct import files, job, outlining, picture_files, pictures, refining, stages
 from rts_reconstruct.arguments import check_counts, check_other_folder, checked_masks, checked_region
 from rts_reconstruct.cameras import with_cameras

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 import rts
-from rts.diagnostics.measuring_api import writing
+from rts.tool_api.files import writing
 from rts_reconstruct import detail, files, job, measures, pictures, posing, sight, stages, texturing
 from rts_reconstruct.exposures import evened, exposures
 from rts_reconstruct.light import decoded

@@ -18,7 +18,7 @@ from seen_ellipsoid import CENTER, RADII, SIZE, cameras, images, on_white, views
 from typer.testing import CliRunner
 
 import rts
-from rts.cli.main import app
+from rts_cli.main import app
 
 TINY = dict(steps=9, size=SIZE, batch=3, held_out=4, texture=32, quick=True, progress=False)
 

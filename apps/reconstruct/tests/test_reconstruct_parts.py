@@ -11,7 +11,7 @@ from rts_reconstruct.saved import Saved
 from seen_ellipsoid import CENTER, DISTANCE, RADII, SIZE, cameras, ellipsoid, images, on_white, views
 
 import rts
-from rts.diagnostics.measuring_api import writing
+from rts.tool_api.files import writing
 
 
 def test_the_world_lies_where_the_cameras_look_and_they_see_the_same():

@@ -12,7 +12,7 @@ from seen_ellipsoid import SIZE, images, on_white, views, written
 from typer.testing import CliRunner
 
 import rts
-from rts.cli.main import app
+from rts_cli.main import app
 
 COUNT = 8
 

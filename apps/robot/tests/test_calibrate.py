@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import rts
-from rts.cli.main import app
+from rts_cli.main import app
 
 torch = pytest.importorskip("torch")
 TRUE = np.linalg.inv(CAMERA.view) @ np.diag([1.0, -1, -1, 1])

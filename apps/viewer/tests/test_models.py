@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from viewed import RED, ball, free_port, view, watching
 
 import rts
-from rts.cli.main import app
+from rts_cli.main import app
 
 pytestmark = pytest.mark.files
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import rts
-from rts.diagnostics.measuring_api import default_camera
+from rts.tool_api.scenes import default_camera
 
 
 def turntable(model: Path, output: Path = Path("turntable.gif"), frames: int = 12) -> None:

@@ -1,0 +1,1 @@
+"""Diagnostics of derivatives: finite differences to compare with, pictures, and reasons for disagreement."""
