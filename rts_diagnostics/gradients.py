@@ -51,12 +51,14 @@ class GradientCheck(NamedTuple):
     def agrees(self, slope: Slope) -> bool:
         """True if autodiff and the difference agree.
 
-        They may differ by the tolerance, three error bars, and an amount negligible beside the other slopes. Slopes in
-        different units are compared by the effect of a one-pixel step on the loss.
+        They may differ by the tolerance, three error bars, and an amount negligible beside the other slopes. The
+        tolerance is relative to the derivative or, where contributions of pixels cancel in it, to the size of these.
+        Slopes in different units are compared by the effect of a one-pixel step on the loss.
         """
         effects = [abs(s.difference * s.step) for s in self.slopes]
         largest = max((x for x in effects if math.isfinite(x)), default=0.0)
-        allowed = self.tolerance * abs(slope.difference) + 3 * slope.error + NEGLIGIBLE * largest / slope.step
+        allowed = self.tolerance * max(abs(slope.difference), slope.contributions)
+        allowed += 3 * slope.error + NEGLIGIBLE * largest / slope.step
         return abs(slope.autodiff - slope.difference) <= allowed
 
     @property

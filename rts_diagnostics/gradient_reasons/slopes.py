@@ -14,6 +14,8 @@ from rts_diagnostics.smoothing import low_pass
 
 NEGLIGIBLE = 0.01
 """The largest negligible effect, as a share of the largest effect of a step."""
+BLOCK = 8
+"""The side of blocks of pixels whose contributions to a derivative are compared with it."""
 STEP_UNSEEN = 1e-2
 """The step of finite differences for a number that nothing seems to depend on."""
 
@@ -27,6 +29,8 @@ class Slope(NamedTuple):
         difference: the central finite difference of renders without splatting, of many samples a pixel.
         error: bound on the error of `difference`: the disagreement of two sampling grids and two steps, and rounding.
         step: the step of the difference, in units of the number.
+        contributions: the norm of what blocks of `BLOCK`² pixels contribute to `difference`: about how large it would
+            be if their signs were random. It is larger than `difference` where these cancel.
     """
 
     name: str
@@ -34,6 +38,7 @@ class Slope(NamedTuple):
     difference: float
     error: float
     step: float
+    contributions: float = 0.0
 
 
 class Number(NamedTuple):
@@ -98,9 +103,12 @@ def differenced(subject: Subject, number: Number, samples: int) -> Number:
 
     (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
     error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3 + max(rounding)
-    slope = number.slope._replace(difference=(coarse + fine) / 2, error=error)
-    noise = float(np.linalg.norm(low_pass((image - other) / 2)))
-    return number._replace(slope=slope, true=((image + other) / 2).astype(np.float32), noise=noise)
+    true, noise = (image + other) / 2, float(np.linalg.norm(low_pass((image - other) / 2)))
+    of_blocks = (subject.weights * true).sum(axis=-1) / step
+    for axis in range(2):
+        of_blocks = np.add.reduceat(of_blocks, np.arange(0, of_blocks.shape[axis], BLOCK), axis=axis)
+    found = {"difference": (coarse + fine) / 2, "error": error, "contributions": float(np.linalg.norm(of_blocks))}
+    return number._replace(slope=number.slope._replace(**found), true=true.astype(np.float32), noise=noise)
 
 
 def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:

@@ -228,6 +228,26 @@ def test_a_derivative_of_the_wrong_sign_differs_however_small_beside_others():
     assert check.agrees(slopes[0]) and not check.agrees(slopes[1]) and not check.ok
 
 
+def test_where_contributions_cancel_the_tolerance_is_relative_to_these():
+    slopes = [gradients.Slope("pose[1]", -51.0, -29.0, 2.0, 0.01, size) for size in (500.0, 100.0)]
+    assert [gradients.GradientCheck([slope], 0.1).ok for slope in slopes] == [True, False]
+
+
+def test_contributions_are_those_of_blocks_of_pixels():
+    """A square of 16 × 16 pixels that moves: 4, 8 and 4 of its rows lie in three rows of blocks, on either side."""
+    camera = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=24)
+    corners = np.array([(-8.0, -8, 0), (8, -8, 0), (8, 8, 0), (-8, 8, 0)])
+
+    def scene(shift):
+        vertices = arrays_like(shift, corners) + shift * arrays_like(shift, [1.0, 0, 0])
+        return rts.Part(MESH(FACES), {"vertices": vertices}, "silhouette"), camera
+
+    start = parameters_of("torch-cpu")["shift"][:1] * 0
+    [slope] = rts.check_gradient(scene, start, (24, 24), loss=lambda image: image[..., 3].sum()).slopes
+    assert slope.difference == pytest.approx(0, abs=0.1)
+    assert slope.contributions == pytest.approx(np.sqrt(2 * (16 + 64 + 16)), rel=0.02)
+
+
 # ------------------------------------------------------------------------------------------- second derivatives
 
 TURNED = 7.0 * np.array([(np.cos(a), np.sin(a), 0) for a in 0.3 + np.pi / 2 * np.arange(4)])
