@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -29,6 +29,8 @@ class Measured(NamedTuple):
         ssim: structural similarity (Wang et al. 2004), the mean over pixels of grey values.
         iou: the overlap of outlines, intersection over union; None where pictures do not tell the object.
         camera: "given", or "fitted" if its pose was fitted to the picture.
+        lacks: the length of the longest part of the picture's object that the render lacks, such as a horn, relative to
+            the root of the object's area; None where pictures do not tell the object.
     """
 
     number: int
@@ -38,6 +40,7 @@ class Measured(NamedTuple):
     ssim: float
     iou: float | None
     camera: str = "given"
+    lacks: float | None = None
 
 
 def shown(model: Model, pictures: Pictures, place: int) -> np.ndarray:
@@ -64,14 +67,25 @@ def measured_view(model: Model, pictures: Pictures, place: int) -> Measured:
     ]
     weights = np.ones(view.size) if view.mask is None else view.mask
     error = float((weights[..., None] * (pair[0] - pair[1]) ** 2).sum() / (3 * max(weights.sum(), 1)))
-    iou = None
+    iou = lacks = None
     if pictures.outlined:
         a, b = (weights > 0.5) & (image[..., 3] > 0.5), (weights > 0.5) & (render[..., 3] > 0.5)
         iou = float((a & b).sum() / max((a | b).sum(), 1))
+        lacks = longest_missing(a, b)
     psnr = -10 * float(np.log10(max(error, SMALL)))
     held_out = place >= len(pictures.views)
     camera = "fitted" if model.poses[place].any() else "given"
-    return Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou, camera)
+    return Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou, camera, lacks)
+
+
+def longest_missing(truth: np.ndarray, found: np.ndarray) -> float:
+    """How far parts of an outline (H, W) bool reach out of another, relative to the root of its area.
+
+    Parts of a single pixel do not count.
+    """
+    missing = scipy.ndimage.binary_opening(truth & ~found, np.ones((2, 2)))
+    away: Any = scipy.ndimage.distance_transform_edt(~found)
+    return float(away[missing].max(initial=0.0) / max(truth.sum(), 1) ** 0.5)
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:

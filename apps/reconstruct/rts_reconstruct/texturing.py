@@ -142,9 +142,36 @@ def fitted(
         callback=lambda step, p, loss: report(step, loss, lambda: (model.vertices, model.faces, colors_of(p))),
         progress=settings.progress,
     )
-    texture = spread(np.clip(texture_of(fit.parameters).numpy(), 0, 1), bare)
+    changes, scale = (scale * fit.parameters["changes"]).numpy(), scale.numpy()
+    weights = np.divide(1, scale**2, out=np.zeros_like(scale), where=scale > 0)
+    changes = without_specks(changes, weights, _footprint(weights, pictures))
+    texture = spread(np.clip(atlas.texture + changes, 0, 1), bare)
     atlas = atlas._replace(texture=texture)
     return model._replace(atlas=atlas, colors=atlas.colors(model.faces, len(model.vertices))), fit.history
+
+
+def without_specks(changes: np.ndarray, weights: np.ndarray, footprint: float) -> np.ndarray:
+    """Changes (R, R, 3) of texels, averaged with those beside, by their weights (R, R, 1), over half a footprint.
+
+    Pictures that contradict one another, as where the shape is off, leave specks: texels below one pixel of any picture
+    that differ, though none tells them apart. Those that pictures hardly show get the mean of those beside.
+
+    Args:
+        changes: of the texels.
+        weights: of the texels in pictures; 0 for those that stay.
+        footprint: the side of a pixel of the pictures on the surface, in texels.
+    """
+    width = (min(footprint / 2, PADDING / 3),) * 2 + (0,)
+    total = scipy.ndimage.gaussian_filter(weights, width)
+    mean = scipy.ndimage.gaussian_filter(weights * changes, width) / np.maximum(total, 1e-30)
+    return np.where(weights > 0, mean, changes)
+
+
+def _footprint(weights: np.ndarray, pictures: Pictures) -> float:
+    """The side of a pixel of the pictures on the surface, in texels: its mean shadow is a fourth of it (Cauchy)."""
+    views = pictures.views
+    covered = [view.image[..., 3].sum() if view.image.shape[2] > 3 else np.prod(view.size) for view in views]
+    return float(np.sqrt((weights > 0).sum() / max(4 * np.mean(covered), 1.0)))
 
 
 def _scales(model: Model, pictures: Pictures) -> np.ndarray:

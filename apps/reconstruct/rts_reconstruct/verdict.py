@@ -19,6 +19,8 @@ PSNR, OVERLAP, AWAY = 13.0, 0.75, 5.0
 """A blob has a smaller PSNR, dB, or overlap of outlines, or points farther away: 90th percentile, % of the diagonal."""
 LOOSE = 0.9
 """The overlap of outlines from which on masks and mesh agree."""
+LACKING = 0.05
+"""The length of a part that the mesh lacks in half of the views, relative to the root of the object's area."""
 FALLEN = 0.7
 """The share of the first losses that the last ones may be."""
 BELOW, DARKER = 0.1, 5.0
@@ -96,6 +98,13 @@ def verdict(
             "has points"
             if settings.robust
             else "the mesh does not fill its outlines: give more --steps, or another --start"
+        )
+    lacks = [row.lacks for row in rows if row.lacks is not None]
+    if lacks and np.median(lacks) > LACKING and not pictures.by_points:
+        worst = max(rows, key=lambda row: row.lacks or 0.0)
+        findings.append(
+            f"the mesh lacks parts that outlines show, such as in {worst.name or worst.number}: leave out --quick, "
+            "give more --steps, or take --start hull"
         )
     if away is not None and away[1] > AWAY:
         findings.append("the mesh is far from COLMAP's points: its outlines are of something else, or --region is")

@@ -12,6 +12,7 @@ from rts_reconstruct import (
     detail,
     exposures,
     files,
+    measures,
     outlining,
     pictures,
     points,
@@ -383,6 +384,38 @@ def test_specks_are_cut_or_kept_with_what_surrounds_them():
 
 
 @pytest.mark.thorough
+def test_texels_that_no_pixel_tells_apart_are_averaged_by_their_weights():
+    rng = np.random.default_rng(0)
+    weights = np.ones((64, 64, 1), np.float32)
+    weights[:, :8], weights[20:24, 20:24] = 0, 1e-3  # A chart's border, and texels that pictures hardly show.
+    edge = np.zeros((64, 64, 3), np.float32)
+    edge[:, 40:] = 0.5
+    specks = np.where(weights < 1, 5, 0.1) * rng.choice([-1.0, 1.0], (64, 64, 3))
+    found = texturing.without_specks(np.float32(edge + specks), weights, 4.0)
+    inside = found[10:-10, 12:36]
+    assert np.abs(inside).max() < 0.1 and inside.std() < 0.03
+    np.testing.assert_allclose(found[:, 45:-5].mean((0, 1)), 0.5, atol=0.02)
+    np.testing.assert_array_equal(found[:, :8], np.float32(edge + specks)[:, :8])
+    np.testing.assert_allclose(texturing.without_specks(edge, weights, 0.0)[:, 8:], edge[:, 8:])
+
+
+def test_a_horn_that_the_mesh_lacks_is_told():
+    y, x = np.mgrid[:80, :80]
+    body = (x - 40) ** 2 + (y - 45) ** 2 < 20**2
+    horn = (abs(x - 40) < 2) & (y > 10) & (y < 40)
+    speck = (x == 5) & (y == 5)
+    whole = body | horn
+    assert measures.longest_missing(whole | speck, body) == pytest.approx(15 / np.sqrt(whole.sum()), rel=0.1)
+    assert measures.longest_missing(body, whole) == measures.longest_missing(body, body) == 0
+    found = pictures.read(views(), SIZE, 0)
+    model = about(found, truth())
+    rows = measured(model, found)
+    assert max(row.lacks for row in rows) < 0.03
+    lacking = [row._replace(lacks=0.1) for row in rows[: len(rows) // 2 + 1]] + rows[len(rows) // 2 + 1 :]
+    told = verdict(model, found, lacking, [[1.0] * 20 + [0.1] * 20], 0.0, Settings(4, 0, False, "mesh", False))
+    assert not told.blob and "the mesh lacks parts that outlines show, such as in" in str(told)
+
+
 def test_detail_of_the_pictures_as_they_are_is_added_to_the_texture():
     fine = 256
     stripes = np.float32([0.5, 0.5, 0.5]) * (1 + np.sign(np.sin(60 * np.linspace(0, 1, 256)))[None, :, None])
