@@ -190,22 +190,6 @@ def test_real_arrays_are_admitted_and_complex_ones_refused(target):
         engine.admitted(arrays(target, np.ones(2), np.complex64), "radii")
 
 
-def test_torch_and_jax_in_one_scene_are_refused_by_name():
-    pytest.importorskip("torch")
-    pytest.importorskip("jax")
-    scene = arrays("torch-cpu", SCENE)
-    for key in ("vertices", "colors", "transform"):
-        mixed = {**scene, key: arrays("jax", SCENE[key])}
-        with pytest.raises(rts.errors.EngineError, match="jax and torch.*convert one side"):
-            image_of(mixed)
-    with pytest.raises(TypeError, match="jax and torch"):
-        rts.render(part_of(scene), camera_at(arrays("jax", SCENE["eye"])), SIZE)
-    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
-    jax_scene = arrays("jax", SCENE)
-    with pytest.raises(rts.errors.EngineError, match="jax and torch"):
-        rts.render_samples(sampled, part_of(jax_scene), camera_at(jax_scene["eye"]))
-
-
 def test_arrays_of_no_engine_are_refused_by_type():
     class Strange:
         shape = (4, 4)
