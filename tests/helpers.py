@@ -53,7 +53,7 @@ def refused(match):
     assert "\n" not in str(error.value)
 
 
-def together(work, count):
+def together(work, count, seconds=120):
     """The results of a function of a number, from 0 on, in as many threads, which begin at once."""
     start = threading.Barrier(count)
 
@@ -62,7 +62,7 @@ def together(work, count):
         return work(number)
 
     with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(begun, range(count), timeout=120))
+        return list(pool.map(begun, range(count), timeout=seconds))
 
 
 # -------------------------------------------------------------------------------------------------- arrays
