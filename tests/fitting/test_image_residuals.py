@@ -508,3 +508,16 @@ def test_a_camera_must_come_from_somewhere():
     residuals = rts.ImageResiduals(scene, None, SIZE, np.zeros(SIZE))
     with pytest.raises(InputError, match="camera is None, and scene gives none"):
         residuals(start("torch-cpu"))
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        (np.zeros(SIZE), "there are several cameras for a target of one view"),
+        (np.zeros((3, *SIZE)), "there are 2 cameras for targets of 3 views"),
+    ],
+)
+def test_a_scene_must_give_as_many_cameras_as_there_are_views(target, said):
+    residuals = rts.ImageResiduals(lambda p: (scene(p), [CAMERA] * 2), None, SIZE, target)
+    with refused(said):
+        residuals(start("torch-cpu"))

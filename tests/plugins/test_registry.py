@@ -308,7 +308,7 @@ def test_a_plugin_whose_options_lack_defaults_is_refused_by_its_name():
     ("call", "words", "hint"),
     [
         (lambda: rts.plugin("rts.samplers", "rastr"), ("no sampler named 'rastr'", "reference"), "'raster'?"),
-        (lambda: rts.plugin("rts.samplers", "qqqqqq"), ("raster",), None),
+        (lambda: rts.plugin("rts.samplers", "qqqqqq"), ("raster", "is its distribution installed"), None),
         (lambda: rts.plugins("sampler"), ("no plugin group 'sampler'", "rts.splatters"), "'rts.samplers'?"),
     ],
 )
