@@ -4,18 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from helpers import (
-    ALL,
-    DIFFERENTIABLE,
-    TORCH,
-    arrays,
-    derivative,
-    gradient,
-    icosphere,
-    relative_error,
-    rigid,
-    to_numpy,
-)
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphere, relative_error, rigid, to_numpy
 
 import rts
 from rts import Camera, Part

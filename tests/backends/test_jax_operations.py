@@ -45,11 +45,7 @@ def numbers(*shape, seed=0):
 
 
 FUNCTIONS = {
-    "projection": (
-        projective_map,
-        projected,
-        (numbers(4, 4).at[2, 3].add(6), numbers(COUNT, 3, seed=1)),
-    ),
+    "projection": (projective_map, projected, (numbers(4, 4).at[2, 3].add(6), numbers(COUNT, 3, seed=1))),
     "interpolation": (
         lambda rows, weights: interpolate(rows, jnp.asarray(IDS), COLUMN, weights),
         interpolated,

@@ -195,12 +195,7 @@ def test_a_mesh_far_from_the_origin_is_sampled_as_well_as_near_it(sampler):
     offset = np.array([1e4, -1e4, 1e4])
     near = rasterize(sampler, vertices.astype(np.float32), faces, Camera.look_at((1, 2, 3), (0, 0, 0)), SIZE, 2)
     far = rasterize(
-        sampler,
-        (vertices + offset).astype(np.float32),
-        faces,
-        Camera.look_at(offset + (1, 2, 3), offset),
-        SIZE,
-        2,
+        sampler, (vertices + offset).astype(np.float32), faces, Camera.look_at(offset + (1, 2, 3), offset), SIZE, 2
     )
     np.testing.assert_array_equal(far.triangle_ids, near.triangle_ids)
     np.testing.assert_allclose(far.barycentrics, near.barycentrics, atol=1e-5)

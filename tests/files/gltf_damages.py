@@ -305,7 +305,4 @@ def tree_cases():
     for place in range(3, len(text), 23):
         flipped = bytearray(text.encode())
         flipped[place] ^= 1 << place % 7
-        yield Case(
-            f"glb: bit {place % 7} of byte {place} of the tree",
-            {"m.glb": glb(None, data, bytes(flipped))},
-        )
+        yield Case(f"glb: bit {place % 7} of byte {place} of the tree", {"m.glb": glb(None, data, bytes(flipped))})

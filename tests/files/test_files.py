@@ -79,8 +79,7 @@ def test_the_texture_of_an_obj_is_upright(tmp_path):
 def test_the_texture_of_a_glb_is_upright(tmp_path):
     image = Image.open(quadrants(tmp_path / "tex.png"))
     visual = trimesh.visual.TextureVisuals(
-        uv=[[0, 0], [1, 0], [1, 1], [0, 1]],
-        material=trimesh.visual.material.PBRMaterial(baseColorTexture=image),
+        uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=trimesh.visual.material.PBRMaterial(baseColorTexture=image)
     )
     vertices = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
@@ -192,10 +191,7 @@ def test_comments_continuations_and_colors_of_an_obj(tmp_path):
 
 
 def test_an_obj_has_one_part_a_material(tmp_path):
-    write(
-        tmp_path / "m.mtl",
-        "newmtl a\nKd 1 0.5 0\nnewmtl b\nKd 1 1 1\nd 0.25\nnewmtl unused\nmap_Kd gone.png\n",
-    )
+    write(tmp_path / "m.mtl", "newmtl a\nKd 1 0.5 0\nnewmtl b\nKd 1 1 1\nd 0.25\nnewmtl unused\nmap_Kd gone.png\n")
     behind = "v 0 0 -1\nv 1 0 -1\nv 0 1 -1\n"
     faces = behind + "usemtl b\nf 1 2 3\nusemtl a\nf 1 3 4\nusemtl b\nf 5 6 7\n"
     b, a = rts.load(write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + faces))

@@ -346,11 +346,7 @@ def silhouette_residuals(target, splatter):
 
 @pytest.mark.parametrize(
     ("target", "method", "options"),
-    [
-        ("torch-cpu", "lm", {}),
-        ("torch-cpu", "adam", {"steps": 250, "learning_rate": 0.01}),
-        ("jax", "lm", {}),
-    ],
+    [("torch-cpu", "lm", {}), ("torch-cpu", "adam", {"steps": 250, "learning_rate": 0.01}), ("jax", "lm", {})],
 )
 def test_a_pose_is_recovered_from_a_silhouette(target, method, options):
     residuals, start = silhouette_residuals(target, "single"), arrays(target, np.zeros(6))

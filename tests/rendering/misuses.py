@@ -270,8 +270,7 @@ GROUPS = {
     "program": {"f": rts.program},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},
     "render_views": open_in(
-        lambda **o: rts.render_views(**{"parts": PART, "cameras": [CAMERA] * 2, "size": SIZE, **o}),
-        *RENDERED,
+        lambda **o: rts.render_views(**{"parts": PART, "cameras": [CAMERA] * 2, "size": SIZE, **o}), *RENDERED
     ),
     "sample": open_in(
         lambda **o: rts.sample(**{"parts": PART, "camera": CAMERA, "size": SIZE, "splatter": None, **o}),

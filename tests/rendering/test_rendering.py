@@ -273,10 +273,7 @@ BAD = {
         lambda: rts.render(PART, CAMERA.replace(view=np.eye(4)[:3]), SIZE),
         ("camera's view", "(3, 4)", "(4, 4)"),
     ),
-    "singular view": (
-        lambda: rts.render(PART, CAMERA.replace(view=np.zeros((4, 4))), SIZE),
-        ("view", "singular"),
-    ),
+    "singular view": (lambda: rts.render(PART, CAMERA.replace(view=np.zeros((4, 4))), SIZE), ("view", "singular")),
     "singular projection": (
         lambda: rts.render(PART, CAMERA.replace(projection=np.diag([1.0, 0, 1, 1])), SIZE),
         ("projection", "singular"),
@@ -291,18 +288,9 @@ BAD = {
     ),
     "cull typo": (lambda: PART.replace(cull="backs"), ("cull", "'backs'", '"back"')),
     "theta not a dict": (lambda: Part(PART.surface, BOX[0]), ("theta", "ndarray", "dict")),
-    "no vertices": (
-        lambda: rts.render(Part(PART.surface, {"points": BOX[0]}), CAMERA, SIZE),
-        ("'vertices'",),
-    ),
-    "flat vertices": (
-        lambda: rts.render(with_theta(vertices=BOX[0][:, :2]), CAMERA, SIZE),
-        ("(8, 2)", "(rows, 3)"),
-    ),
-    "vertices in one row": (
-        lambda: rts.render(with_theta(vertices=BOX[0].ravel()), CAMERA, SIZE),
-        ("(24,)",),
-    ),
+    "no vertices": (lambda: rts.render(Part(PART.surface, {"points": BOX[0]}), CAMERA, SIZE), ("'vertices'",)),
+    "flat vertices": (lambda: rts.render(with_theta(vertices=BOX[0][:, :2]), CAMERA, SIZE), ("(8, 2)", "(rows, 3)")),
+    "vertices in one row": (lambda: rts.render(with_theta(vertices=BOX[0].ravel()), CAMERA, SIZE), ("(24,)",)),
     "whole vertices": (
         lambda: rts.render(with_theta(vertices=BOX[0].astype(int)), CAMERA, SIZE),
         ("vertices", "int64", "floating"),
@@ -316,10 +304,7 @@ BAD = {
     "quads": (lambda: Mesh([(0, 1, 2, 3)]), ("faces", "(1, 4)", "(T, 3)")),
     "no faces": (lambda: Mesh(np.zeros((0, 3), int)), ("faces", "(0, 3)", "at least one")),
     "faces beyond int32": (lambda: Mesh([(0, 1, 2**40)]), ("faces", str(2**40), "2**31")),
-    "uv indices of another length": (
-        lambda: Mesh(BOX[1], {"uv": [(0, 1, 2)]}),
-        ("indices['uv']", "(1, 3)", "(12, 3)"),
-    ),
+    "uv indices of another length": (lambda: Mesh(BOX[1], {"uv": [(0, 1, 2)]}), ("indices['uv']", "(1, 3)", "(12, 3)")),
     "uv rows missing": (
         lambda: rts.render(with_theta(uv=UV[:5], texture=np.ones((2, 2, 3))), CAMERA, SIZE),
         ("theta['uv']", "5 rows", "row 7"),
@@ -348,10 +333,7 @@ BAD = {
         lambda: rts.render(with_theta(color=np.array(0.5)), CAMERA, SIZE),
         ("theta['color']", "()", "(3,) or (4,)"),
     ),
-    "textured without a texture": (
-        lambda: rts.render(with_theta("textured", uv=UV), CAMERA, SIZE),
-        ("texture",),
-    ),
+    "textured without a texture": (lambda: rts.render(with_theta("textured", uv=UV), CAMERA, SIZE), ("texture",)),
     "textured without uv": (
         lambda: rts.render(with_theta("textured", texture=np.ones((2, 2, 3))), CAMERA, SIZE),
         ("uv",),
@@ -383,10 +365,7 @@ BAD = {
         lambda: rts.render(with_theta("lambert", light={"dirction": np.ones(3)}), CAMERA, SIZE),
         ("light", "'dirction'", "direction"),
     ),
-    "background of two": (
-        lambda: rts.render(PART, CAMERA, SIZE, background=(0, 1)),
-        ("background", "(2,)", "(4,)"),
-    ),
+    "background of two": (lambda: rts.render(PART, CAMERA, SIZE, background=(0, 1)), ("background", "(2,)", "(4,)")),
     "background of another size": (
         lambda: rts.render(PART, CAMERA, SIZE, background=np.ones((5, 6, 3))),
         ("background", "(5, 6, 3)", "(20, 24, 3)"),

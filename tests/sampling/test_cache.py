@@ -337,11 +337,7 @@ def test_a_prepared_part_takes_other_shaders_and_theta_but_no_other_surface():
     colors = np.random.default_rng(0).uniform(size=vertices.shape).astype(np.float32)
     part = Part(Mesh(faces), {"vertices": vertices, "colors": colors}, "unlit")
     handle = rts.prepare(part, "raster")
-    for changes in (
-        {"shader": "normals"},
-        {"theta": {"vertices": vertices, "colors": 1 - colors}},
-        {"cull": "back"},
-    ):
+    for changes in ({"shader": "normals"}, {"theta": {"vertices": vertices, "colors": 1 - colors}}, {"cull": "back"}):
         found = rts.render(handle.replace(**changes), CAMERA, SIZE)
         np.testing.assert_array_equal(found, rts.render(part.replace(**changes), CAMERA, SIZE, sampler="raster"))
     with pytest.raises(InputError, match="rts.prepare"):

@@ -281,10 +281,7 @@ CONSTRUCTORS = {
         lambda a: Camera.from_pytorch3d(**a, size=SIZE),
         {"R": POSE[:3, :3], "T": (0.1, 0.2, 6.0), "focal_length": (3.0, 2.0), "principal_point": (0.1, -0.2), **PLANES},
     ),
-    "from_blender": (
-        lambda a: Camera.from_blender(**a, size=SIZE),
-        {"camera_to_world": POSE, "focal": 50.0, **PLANES},
-    ),
+    "from_blender": (lambda a: Camera.from_blender(**a, size=SIZE), {"camera_to_world": POSE, "focal": 50.0, **PLANES}),
 }
 VIEW_WEIGHTS, PROJECTION_WEIGHTS = np.random.default_rng(0).normal(size=(2, 4, 4))
 

@@ -4,16 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import (
-    ALL,
-    TORCH,
-    arrays,
-    derivative,
-    finite_difference,
-    gradient,
-    icosphere,
-    to_numpy,
-)
+from helpers import ALL, TORCH, arrays, derivative, finite_difference, gradient, icosphere, to_numpy
 
 import rts
 from rts.splatting import Multi, Plain, Single, exact_calibration
