@@ -121,7 +121,7 @@ AT_POINTS = [(name, kind, True) for name in (*SAMPLERS, "embree") for kind in KI
         for case in AT_CENTRES + AT_POINTS
     ],
 )
-def test_fragments_are_the_nearest_hits_of_the_ray_of_each_pixel_or_point(name, kind, elsewhere, camera):
+def test_fragments_are_the_nearest_hits_of_each_ray(name, kind, elsewhere, camera):
     try:
         sampler = rts.plugin("samplers", name)()
     except rts.errors.PluginError as error:
