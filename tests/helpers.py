@@ -1,15 +1,18 @@
 """Helpers of the tests: arrays of every engine, small meshes, derivatives by the frameworks themselves."""
 
+import contextlib
 import importlib.util
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 import rts
-from rts import Camera, Part
+from rts import Camera, InputError, Part
 from rts.arrays.engines import is_constant
 from rts.arrays.trees import map_leaves
-from rts.contracts.records import Cells, Splats
+from rts.contracts.records import Cells, Samples, Splats
 
 
 def _torch_targets():
@@ -25,12 +28,41 @@ DIFFERENTIABLE = [*TORCH, "jax"]
 ALL = ["numpy", *DIFFERENTIABLE]
 
 
+def _sampler(name, package):
+    missing = importlib.util.find_spec(package) is None
+    return pytest.param(name, marks=pytest.mark.skipif(missing, reason=f"needs {package}"))
+
+
+TRIANGLE_SAMPLERS = ["raster", "reference", _sampler("embree", "embreex"), _sampler("opengl", "moderngl")]
+"""Samplers of triangles by name; those whose package is missing are skipped."""
+
+
 def quick(values, count=1):
     """Parameters of a test, of which `make test` tries the first ones and `make test-all` the rest."""
     return [
         pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=[pytest.mark.thorough] * (number >= count))
         for number, v in enumerate(values)
     ]
+
+
+@contextlib.contextmanager
+def refused(match):
+    """An InputError of one line, in which the pattern is found."""
+    with pytest.raises(InputError, match=match) as error:
+        yield error
+    assert "\n" not in str(error.value)
+
+
+def together(work, count, seconds=120):
+    """The results of a function of a number, from 0 on, in as many threads, which begin at once."""
+    start = threading.Barrier(count)
+
+    def begun(number):
+        start.wait(60)
+        return work(number)
+
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(begun, range(count), timeout=seconds))
 
 
 # -------------------------------------------------------------------------------------------------- arrays
@@ -54,6 +86,20 @@ def arrays(target, tree, dtype=np.float32):
         return convert(x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x)
 
     return map_leaves(leaf, tree)
+
+
+@contextlib.contextmanager
+def precision(target, dtype=np.float64):
+    """While it lasts, floats of "jax" may be float64, if that is the `dtype`; those of other engines always may."""
+    if target != "jax" or dtype != np.float64:
+        yield
+        return
+    config = pytest.importorskip("jax").config
+    config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        config.update("jax_enable_x64", False)
 
 
 def to_numpy(tree):
@@ -185,6 +231,20 @@ def soup(count, seed=0, extent=1.0, size=0.7):
     centers = rng.uniform(-extent, extent, (count, 1, 3))
     corners = centers + rng.normal(0.0, size, (count, 3, 3))
     return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+def open_edges(faces):
+    """The edges (E, 2) of triangles that not exactly two of them share; no two may run along one in one direction."""
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    edges, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+    return edges[counts != 2]
+
+
+def samples_at(ids, params):
+    """Samples of ids (N,) or (N, I) and parameters (N, Q), which no cell refers to."""
+    cells = Cells(np.full((1, 1, 1), -1, np.int32), np.zeros((1, 1, 1), np.float32))
+    return Samples(np.asarray(ids, np.int32).reshape(len(params), -1), params, cells, np.int32(0))
 
 
 def moved(transform, points):

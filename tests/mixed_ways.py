@@ -14,7 +14,7 @@ import warnings
 import numpy as np
 import pytest
 from found_outlines import sampled_with_outlines
-from helpers import arrays, derivative, gradient, to_numpy
+from helpers import arrays, derivative, gradient, precision, to_numpy
 from mixed_scenes import mixed_of
 
 import rts
@@ -122,7 +122,7 @@ def result_of(scene, way, view=0):
     layers = "auto" if "found" in way else _layers(scene, way)
     options = {"layers": layers, "supersample": scene.supersample}
     options["sampler"] = next((name for name in SAMPLERS if name in way), "auto")
-    with _float64(engine), _patched(way), warnings.catch_warnings():
+    with precision(engine), _patched(way), warnings.catch_warnings():
         for kind in IGNORED:
             warnings.simplefilter("ignore", kind)
         if "enough" in way:
@@ -231,20 +231,6 @@ def _thin_bands(_, size):
 
 def _flat(tree):
     return np.concatenate([np.ravel(x) for x in leaves(tree)])
-
-
-@contextlib.contextmanager
-def _float64(engine):
-    """Numbers of jax in float64."""
-    if engine != "jax":
-        yield
-        return
-    config = __import__("jax").config
-    config.update("jax_enable_x64", True)
-    try:
-        yield
-    finally:
-        config.update("jax_enable_x64", False)
 
 
 def ways_of(number, every):

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import elsewhere
 import numpy as np
 import pytest
+from example_surfaces import part_of
 from helpers import icosphere, relative_error, to_numpy
 
 import rts
@@ -123,13 +124,6 @@ def ball(shader="lambert", move=(0.0, 0.0, 0.0), **theta):
     return rts.Part(rts.Mesh(FACES), arrays, shader)
 
 
-def example(name):
-    try:
-        return rts.plugin("surfaces", name).example()
-    except rts.errors.PluginError as error:
-        pytest.skip(str(error))
-
-
 def textured(shader="textured"):
     uv = (BALL[:, :2] + 1) / 2
     return rts.Part(
@@ -172,11 +166,11 @@ def embossed():
 
 CASES = {
     **{
-        name: lambda name=name: Case((example(name),))
+        name: lambda name=name: Case((part_of(name),))
         for name in ("mesh", "skinned", "bezier", "bspline", "revolution")
     },
-    "subdivision": lambda: Case((example("subdivision"),)),
-    "isosurface": lambda: Case((example("isosurface"),)),
+    "subdivision": lambda: Case((part_of("subdivision"),)),
+    "isosurface": lambda: Case((part_of("isosurface"),)),
     "sdf": lambda: Case((rts.Part(rts.Sdf(field, 1.4), {"radius": np.array(0.9)}, "normals"),)),
     **{
         name: lambda name=name: Case((ball(),), {"splatter": name, "layers": 1 if name == "single" else 2})

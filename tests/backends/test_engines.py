@@ -4,18 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from helpers import (
-    ALL,
-    DIFFERENTIABLE,
-    TORCH,
-    arrays,
-    derivative,
-    gradient,
-    icosphere,
-    relative_error,
-    rigid,
-    to_numpy,
-)
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphere, relative_error, rigid, to_numpy
 
 import rts
 from rts import Camera, Part
@@ -188,22 +177,6 @@ def test_real_arrays_are_admitted_and_complex_ones_refused(target):
     assert engine.admitted(real, "radii") is real
     with pytest.raises(rts.InputError, match="^radii has dtype .*complex64; expected real numbers"):
         engine.admitted(arrays(target, np.ones(2), np.complex64), "radii")
-
-
-def test_torch_and_jax_in_one_scene_are_refused_by_name():
-    pytest.importorskip("torch")
-    pytest.importorskip("jax")
-    scene = arrays("torch-cpu", SCENE)
-    for key in ("vertices", "colors", "transform"):
-        mixed = {**scene, key: arrays("jax", SCENE[key])}
-        with pytest.raises(rts.errors.EngineError, match="jax and torch.*convert one side"):
-            image_of(mixed)
-    with pytest.raises(TypeError, match="jax and torch"):
-        rts.render(part_of(scene), camera_at(arrays("jax", SCENE["eye"])), SIZE)
-    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
-    jax_scene = arrays("jax", SCENE)
-    with pytest.raises(rts.errors.EngineError, match="jax and torch"):
-        rts.render_samples(sampled, part_of(jax_scene), camera_at(jax_scene["eye"]))
 
 
 def test_arrays_of_no_engine_are_refused_by_type():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import icosphere, quad, quick, rotation, soup
+from helpers import icosphere, quad, rotation, soup
 
 import rts
 from rts import Camera
@@ -109,27 +109,19 @@ CAMERAS = {
 # ---------------------------------------------------------------------------------------- against ray casting
 
 
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-@pytest.mark.parametrize("kind", quick(KINDS, 3))
-@pytest.mark.parametrize("sampler", SAMPLERS)
-def test_fragments_are_the_nearest_hits_of_each_ray(sampler, kind, camera):
-    near, far = (3.5, 4.0) if camera is CAMERAS["between close planes"] else (NEAR, FAR)
-    vertices, faces = triangles(kind)
-    total = 0
-    for layers, cull in ((1, "none"), (2, "back"), (4, "none")):
-        found = rasterize(sampler, vertices, faces, camera, SIZE, layers, cull)
-        ids, barycentrics, depth = cast(vertices, faces, camera, SIZE, layers, cull, near, far)
-        np.testing.assert_array_equal(found.triangle_ids, ids)
-        np.testing.assert_allclose(found.barycentrics, barycentrics, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(found.depth, depth, rtol=1e-6)
-        total += (ids >= 0).sum()
-    assert total > 5
+AT_CENTRES = [(name, kind, False) for name in SAMPLERS for kind in KINDS]
+AT_POINTS = [(name, kind, True) for name in (*SAMPLERS, "embree") for kind in KINDS]
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-@pytest.mark.parametrize("kind", quick(KINDS))
-@pytest.mark.parametrize("name", ["raster", "reference", "embree"])
-def test_fragments_at_points_are_the_nearest_hits_of_their_rays(name, kind, camera):
+@pytest.mark.parametrize(
+    ("name", "kind", "elsewhere"),
+    [
+        pytest.param(*case, marks=[pytest.mark.thorough] * (case[1] not in KINDS[: 1 if case[2] else 3]))
+        for case in AT_CENTRES + AT_POINTS
+    ],
+)
+def test_fragments_are_the_nearest_hits_of_each_ray(name, kind, elsewhere, camera):
     try:
         sampler = rts.plugin("samplers", name)()
     except rts.errors.PluginError as error:
@@ -137,11 +129,14 @@ def test_fragments_at_points_are_the_nearest_hits_of_their_rays(name, kind, came
     near, far = (3.5, 4.0) if camera is CAMERAS["between close planes"] else (NEAR, FAR)
     vertices, faces = triangles(kind)
     host = Camera(np.asarray(camera.view, np.float64), np.asarray(camera.projection, np.float64))
-    points = np.random.default_rng(0).uniform((0, 0), SIZE[::-1], (700, 2))
+    points = np.random.default_rng(0).uniform((0, 0), SIZE[::-1], (700, 2)) if elsewhere else None
     proxy, total = Proxy(vertices, faces), 0
     for layers, cull in ((1, "none"), (2, "back"), (4, "none")):
-        view = host, SIZE, layers, cull
-        found = sampler.rasterize_points(sampler.prepare(proxy), *view, points) or at_points(proxy, *view, points)
+        view, prepared = (host, SIZE, layers, cull), sampler.prepare(proxy)
+        if elsewhere:
+            found = sampler.rasterize_points(prepared, *view, points) or at_points(proxy, *view, points)
+        else:
+            found = sampler.rasterize(prepared, *view)
         ids, barycentrics, depth = cast(vertices, faces, camera, SIZE, layers, cull, near, far, points)
         np.testing.assert_array_equal(found.triangle_ids, ids)
         np.testing.assert_allclose(found.barycentrics, barycentrics, rtol=1e-6, atol=1e-6)
@@ -160,15 +155,6 @@ def test_raster_finds_what_the_reference_finds_among_thousands(camera):
             np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
             np.testing.assert_allclose(found.barycentrics, expected.barycentrics, rtol=1e-6, atol=1e-6)
             np.testing.assert_allclose(found.depth, expected.depth, rtol=1e-6)
-
-
-@pytest.mark.parametrize("sampler", SAMPLERS)
-def test_of_triangles_at_one_depth_the_first_is_in_front(sampler):
-    vertices, faces = quad(-9, 9, -9, 9)
-    faces = np.concatenate([faces, faces, faces])
-    found = rasterize(sampler, vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), SIZE, 3)
-    np.testing.assert_array_equal(found.triangle_ids[1], found.triangle_ids[0] + 2)
-    np.testing.assert_array_equal(found.triangle_ids[2], found.triangle_ids[0] + 4)
 
 
 # ------------------------------------------------------------------------------------------- shared edges
@@ -209,12 +195,7 @@ def test_a_mesh_far_from_the_origin_is_sampled_as_well_as_near_it(sampler):
     offset = np.array([1e4, -1e4, 1e4])
     near = rasterize(sampler, vertices.astype(np.float32), faces, Camera.look_at((1, 2, 3), (0, 0, 0)), SIZE, 2)
     far = rasterize(
-        sampler,
-        (vertices + offset).astype(np.float32),
-        faces,
-        Camera.look_at(offset + (1, 2, 3), offset),
-        SIZE,
-        2,
+        sampler, (vertices + offset).astype(np.float32), faces, Camera.look_at(offset + (1, 2, 3), offset), SIZE, 2
     )
     np.testing.assert_array_equal(far.triangle_ids, near.triangle_ids)
     np.testing.assert_allclose(far.barycentrics, near.barycentrics, atol=1e-5)

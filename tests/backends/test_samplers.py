@@ -151,7 +151,6 @@ def test_a_rendered_picture_does_not_depend_on_the_sampler(sampler, data):
 
 
 @cache
-@cache
 def soup_expectation(scene, camera, cull):
     return rasterize("reference", *SCENES[scene](), CAMERAS[camera], SIZE, 4, cull)
 
@@ -265,13 +264,13 @@ def test_a_quad_with_edges_through_pixel_centres_is_at_most_those_wider(sampler)
 
 
 @pytest.mark.parametrize("copies", [2, 3])
-def test_of_triangles_at_one_depth_all_are_kept_and_the_first_is_in_front(sampler, copies):
+def test_of_triangles_at_one_depth_all_are_kept_and_the_first_is_in_front(every, copies):
     vertices, faces = icosphere(2)
     many = np.concatenate([faces] * copies)
     one = rasterize("reference", vertices, faces, CAMERAS["perspective"], SIZE, 1, "back").triangle_ids[0]
-    found = rasterize(sampler, vertices, many, CAMERAS["perspective"], SIZE, copies, "back").triangle_ids
+    found = rasterize(every, vertices, many, CAMERAS["perspective"], SIZE, copies, "back").triangle_ids
     same = found[0] == one
-    assert same.sum() > 1000 and (~same).sum() < 10
+    assert same.sum() > 1000 and (~same).sum() < (10 if every in SAMPLERS else 1)
     assert (one >= 0).sum() > 1000
     for k in range(copies):
         np.testing.assert_array_equal(found[k][same], np.where(one >= 0, one + k * len(faces), -1)[same])

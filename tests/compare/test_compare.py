@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers import quad
+from helpers import quad, refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -681,9 +681,8 @@ class TestMisuse:
         ],
     )
     def test_compare(self, given, message):
-        with pytest.raises(InputError, match=message) as caught:
+        with refused(message):
             compare(given.pop("scene"), given.pop("parameters", None), progress=False, **given)
-        assert "\n" not in str(caught.value)
 
     @pytest.mark.parametrize("name", ["splatters", "samplers", "engines"])
     def test_unknown_plugin(self, name):
@@ -706,9 +705,7 @@ class TestMisuse:
             compare("thin wires", progress=False)
 
     def test_engines_without_derivatives(self):
-        with pytest.raises(
-            InputError, match=r"engines is \['numpy'\], without derivatives, .*; expected some of torch"
-        ):
+        with refused(r"engines is \['numpy'\], without derivatives, .*; expected some of torch"):
             compare("thin wires", engines=["numpy"], progress=False)
         found, left_out = engines(["numpy", "torch"])
         assert [engine.name for engine in found] == ["torch"]

@@ -184,6 +184,8 @@ def test_a_wrong_number_of_processes_is_refused(processes):
         rts.warmup(processes)
 
 
+DOUBLE = "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
+
 SAVING = """
 import sys
 sys.path.insert(0, {folder!r})
@@ -197,9 +199,7 @@ double(np.zeros(3, np.{kind}))
 @pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
 @pytest.mark.thorough
 def test_loops_are_written_by_one_process_at_a_time(tmp_path):
-    (tmp_path / "several.py").write_text(
-        "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
-    )
+    (tmp_path / "several.py").write_text(DOUBLE)
     kept = tmp_path / "__pycache__"
     kept.mkdir()
 
@@ -275,9 +275,6 @@ DAMAGES = {
     "index cut short": (".nbi", lambda data: data[: len(data) // 2]),
     "index of noise": (".nbi", lambda data: bytes(255 - i % 256 for i in range(len(data)))),
 }
-
-
-DOUBLE = "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
 
 
 def called(folder):
@@ -358,9 +355,7 @@ print(sum(several.double.stats.cache_hits.values()), "rts.compiling.numba_intern
 )
 @pytest.mark.thorough
 def test_loops_are_kept_by_a_numba_without_private_names(change, private, tmp_path):
-    (tmp_path / "several.py").write_text(
-        "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
-    )
+    (tmp_path / "several.py").write_text(DOUBLE)
     variables = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     code = WITHOUT_PRIVATE_NAMES.format(folder=str(tmp_path), change=change)
     for hits in (0, 1):

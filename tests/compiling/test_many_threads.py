@@ -6,11 +6,11 @@ and leaves out nothing.
 
 import functools
 import os
-import threading
 import warnings
 
 import numpy as np
 import pytest
+from helpers import together
 
 import rts
 from rts.arrays.engines import constants, engine_named
@@ -91,10 +91,8 @@ def test_eight_threads_compute_what_one_does(name):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", EmptyImageWarning)
             given = pairs(engine)
-            start = threading.Barrier(THREADS)
 
-            def work(number, given=given, start=start):
-                start.wait(60)
+            def work(number, given=given):
                 # Half of the threads begin with the same scene, the others where nobody else is.
                 first = number // 2 * len(given) // THREADS if number % 2 else 0
                 turn = given[first:] + given[:first]
@@ -106,9 +104,5 @@ def test_eight_threads_compute_what_one_does(name):
                     except Exception as error:
                         wrong.append(f"{label}: {type(error).__name__}: {error}")
 
-            threads = [threading.Thread(target=work, args=(number,)) for number in range(THREADS)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join(600)
-        assert not wrong and not any(thread.is_alive() for thread in threads), sorted(set(wrong))
+            together(work, THREADS, 600)
+        assert not wrong, sorted(set(wrong))

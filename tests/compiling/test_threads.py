@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import Ellipsoid
-from helpers import icosphere, quick, soup
+from helpers import icosphere, quick, soup, together
 
 import rts
 from rts import Camera, Part
@@ -70,23 +70,12 @@ def test_two_threads_render_what_one_does_after_the_other(name, shared, moving):
     samplers = (first, first if shared else made(name))
     sizes = ((24, 30), (33, 20))
     expected = [pictures(name, made(name), kind, 24, sizes[kind], moving) for kind in (0, 1)]
-    found, errors, start = [None, None], [], threading.Barrier(2)
 
     def work(kind):
-        try:
-            start.wait(30)
-            found[kind] = pictures(name, samplers[kind], kind, 24, sizes[kind], moving)
-        except BaseException as error:
-            errors.append(error)
+        return pictures(name, samplers[kind], kind, 24, sizes[kind], moving)
 
-    threads = [threading.Thread(target=work, args=(kind,)) for kind in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(120)
-    assert not errors and not any(t.is_alive() for t in threads)
-    for kind in (0, 1):
-        np.testing.assert_array_equal(found[kind], expected[kind])
+    for kind, found in enumerate(together(work, 2)):
+        np.testing.assert_array_equal(found, expected[kind])
 
 
 def test_threads_may_share_a_part_and_a_handle(name):
@@ -94,27 +83,14 @@ def test_threads_may_share_a_part_and_a_handle(name):
     handle = rts.prepare(part, sampler)
     moves = [rts.rigid(np.float32([0, 0.2 * i, 0, 0, 0, 0])) for i in range(12)]
     expected = [rts.render(part.replace(transform=m), CAMERA, (20, 25), sampler=sampler) for m in moves]
-    found, errors = {}, []
 
-    def work(who, prepared):
-        try:
-            for i, move in enumerate(moves):
-                if prepared:
-                    found[who, i] = rts.render(handle.replace(transform=move), CAMERA, (20, 25))
-                else:
-                    found[who, i] = rts.render(part.replace(transform=move), CAMERA, (20, 25), sampler=sampler)
-        except BaseException as error:
-            errors.append(error)
+    def work(who):
+        if who % 2:
+            return [rts.render(part.replace(transform=m), CAMERA, (20, 25), sampler=sampler) for m in moves]
+        return [rts.render(handle.replace(transform=m), CAMERA, (20, 25)) for m in moves]
 
-    threads = [threading.Thread(target=work, args=(who, who % 2 == 0)) for who in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(120)
-    assert not errors
-    for (_, i), image in found.items():
-        np.testing.assert_array_equal(image, expected[i])
-    assert len(found) == 36
+    for found in together(work, 3):
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.fixture
@@ -129,23 +105,18 @@ def helpers(monkeypatch):
 def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
     from rts.compiling import threads
 
-    start, done = threading.Barrier(8), []
+    done = []
 
     def loop(start, stop):
         time.sleep(0.001)
         done.append(stop - start)
 
-    def work():
-        start.wait(30)
+    def work(_):
         for _ in range(20):
             threads.parallel(loop, 9)
 
     monkeypatch.setenv("RTS_NUM_THREADS", "3")
-    together = [threading.Thread(target=work) for _ in range(8)]
-    for thread in together:
-        thread.start()
-    for thread in together:
-        thread.join(60)
+    together(work, 8)
     assert helpers.count == 2
     assert sum(done) == 8 * 20 * 9
 

@@ -3,24 +3,8 @@
 from sheets import BINARIES, BROKEN, TEXTS, Case, model
 
 COUNTS = (
-    "+{}",
-    "0{}",
-    "{}.0",
-    "-{}",
-    "{}_",
-    "{}e0",
-    "0x{}",
-    "",
-    "nine",
-    "0",
-    "7",
-    "10",
-    "4000000000",
-    "\u0669",
-    "\u00a0{}",
-    "{},",
-    "{} {}",
-    "\u2079",
+    *"+{} 0{} {}.0 -{} {}_ {}e0 0x{} nine 0 7 10 4000000000 \u0669 {}, \u2079".split(),
+    *("", "\u00a0{}", "{} {}"),
 )
 
 
@@ -59,22 +43,8 @@ def header_cases():
             text = TEXTS["off"].replace("9 8 0", " ".join(counts))
             yield Case(f"off: {' '.join(counts)!r}", model("off", text))
     for word in (
-        "off",
-        "Off",
-        "coff",
-        "COFF",
-        "NOFF",
-        "STOFF",
-        "4OFF",
-        "nOFF",
-        "OFF BINARY",
-        "OFFX",
-        "OF",
-        "",
-        "OFF:",
-        "# off",
-        "\u039fFF",
-        "OFF\u00a0",
+        *"off Off coff COFF NOFF STOFF 4OFF nOFF OFFX OF OFF: \u039fFF".split(),
+        *("OFF BINARY", "", "# off", "OFF\u00a0"),
     ):
         yield Case(f"off: begins with {word!r}", model("off", TEXTS["off"].replace("OFF", word)))
     yield Case("off: counts in the first line", model("off", TEXTS["off"].replace("OFF\n", "OFF ")))

@@ -83,30 +83,8 @@ def tree_changes():
     for i in (0, 2):
         of = f"bufferViews.{i}"
         for value in (
-            0,
-            1,
-            2,
-            4,
-            8,
-            11,
-            12,
-            13,
-            16,
-            20,
-            22,
-            23,
-            24,
-            25,
-            26,
-            28,
-            32,
-            36,
-            256,
-            10**6,
-            -24,
-            "24",
-            24.0,
-            None,
+            *(0, 1, 2, 4, 8, 11, 12, 13, 16, 20, 22, 23, 24, 25, 26, 28, 32, 36, 256, 10**6),
+            *(-24, "24", 24.0, None),
         ):
             if value is not None or i == 0:
                 yield f"byteStride of view {i} {value!r}", _set(f"{of}.byteStride", value), ""
@@ -305,7 +283,4 @@ def tree_cases():
     for place in range(3, len(text), 23):
         flipped = bytearray(text.encode())
         flipped[place] ^= 1 << place % 7
-        yield Case(
-            f"glb: bit {place % 7} of byte {place} of the tree",
-            {"m.glb": glb(None, data, bytes(flipped))},
-        )
+        yield Case(f"glb: bit {place % 7} of byte {place} of the tree", {"m.glb": glb(None, data, bytes(flipped))})

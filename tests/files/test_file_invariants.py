@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import trimesh
-from helpers import moved
+from helpers import moved, samples_at
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -15,9 +15,7 @@ from PIL import Image
 from strategies import PROPERTIES, examples, reals, sizes, steps, table
 
 import rts
-from rts.contracts.records import Cells
 from rts.files.srgb import decode_srgb, encode_srgb
-from rts.plugin_api.records import Samples
 
 pytestmark = pytest.mark.files
 
@@ -37,9 +35,7 @@ def at_corners(part):
     tables = part.surface.proxy(part.theta["vertices"], None, (1, 1)).ids.reshape(len(part.surface.faces), -1, 3)
     # Barycentrics of zero give the last corner exactly.
     ids = np.stack([np.roll(tables, 2 - i, axis=2) for i in range(3)], axis=1).reshape(3 * len(tables), -1)
-    none = np.full((1, 1, 1), -1, np.int32)
-    samples = Samples(ids, np.zeros((len(ids), 2), np.float32), Cells(none, none), np.int32(0))
-    gbuffer = part.surface.evaluate(part.theta, samples)
+    gbuffer = part.surface.evaluate(part.theta, samples_at(ids, np.zeros((len(ids), 2), np.float32)))
     return {name: gbuffer[name].reshape(len(tables), 3, -1) for name in gbuffer}
 
 

@@ -40,12 +40,7 @@ def test_lights_are_in_the_form_that_shaders_read(tmp_path):
         {"type": "directional"},
         {"type": "point", "range": 5},
     ]
-    nodes = [
-        {"rotation": QUARTER_ABOUT_Y, "scale": [3, 3, 3]},
-        {"translation": [1, 2, 3]},
-        {},
-        {"children": []},
-    ]
+    nodes = [{"rotation": QUARTER_ABOUT_Y, "scale": [3, 3, 3]}, {"translation": [1, 2, 3]}, {}, {"children": []}]
     gltf = lit(tmp_path, lights, nodes)
     found = read_lights(gltf)
     assert set(found) == {"direction", "color", "position", "intensity", "ambient"} and found["ambient"] == 0

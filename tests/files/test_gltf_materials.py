@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from gltf_accessors import stored
 from PIL import Image
 
 import rts
@@ -36,23 +37,16 @@ def model(folder, material, images=(), uv=True, more=None, **tables):
     """
     coordinates = {"TEXCOORD_0": CORNERS[:, :2]} if uv else {}
     tables = {"POSITION": CORNERS, **coordinates, **{name: np.float32(x) for name, x in tables.items()}}
-    views, accessors, data = [], [], b""
-    for i, rows in enumerate(tables.values()):
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": rows.nbytes})
-        accessors.append({"bufferView": i, "componentType": 5126, "count": 3, "type": f"VEC{rows.shape[1]}"})
-        data += rows.tobytes()
-    accessors[0] |= {"min": [0, 0, 0], "max": [1, 1, 0]}
     tree = {
         "asset": {"version": "2.0"},
-        "buffers": [{"uri": "data:;base64," + base64.b64encode(data).decode(), "byteLength": len(data)}],
-        "bufferViews": views,
-        "accessors": accessors,
-        "meshes": [{"primitives": [{"attributes": {name: i for i, name in enumerate(tables)}, "material": 0}]}],
         "nodes": [{"mesh": 0}],
         "scenes": [{"nodes": [0]}],
         "materials": [material],
         **(more or {}),
     }
+    attributes = {name: stored(tree, rows) for name, rows in tables.items()}
+    tree["accessors"][0] |= {"min": [0, 0, 0], "max": [1, 1, 0]}
+    tree["meshes"] = [{"primitives": [{"attributes": attributes, "material": 0}]}]
     if images:
         tree |= {
             "images": [{"uri": picture(x)} for x in images],

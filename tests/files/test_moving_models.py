@@ -1,10 +1,10 @@
 """Models that move: `rts.load_model`, clips and poses, and what is refused of them."""
 
-import base64
 import json
 
 import numpy as np
 import pytest
+from gltf_accessors import stored, viewed
 from helpers import DIFFERENTIABLE, arrays, rotation, to_numpy
 from PIL import Image, ImageSequence
 from typer.testing import CliRunner
@@ -20,6 +20,7 @@ pytestmark = pytest.mark.files
 
 VERTICES = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (1, 2, 0), (0, 2, 0)], np.float32)
 FACES = np.array([(0, 1, 2), (0, 2, 3), (3, 2, 4), (3, 4, 5)], np.uint16)
+BOUNDS = {"min": [0, 0, 0], "max": [1, 2, 0]}
 HALF = np.sqrt(0.5)
 
 
@@ -27,12 +28,13 @@ class Bar:
     """A glTF of a bar: nodes 0 (the mesh), 1 and 2 (its joints, the second 1 above the first), and a clip."""
 
     def __init__(self):
-        self.views, self.accessors, self.data = [], [], b""
+        self.tree = {}
         weights = np.array([(1, 0, 0, 0), (1, 0, 0, 0), (0.5, 0.5, 0, 0), (0.5, 0.5, 0, 0), (0, 1, 0, 0), (0, 1, 0, 0)])
         joints = np.tile(np.array([0, 1, 0, 0], np.uint8), (6, 1))
         above = np.tile(np.eye(4), (2, 1, 1))
         above[1, 1, 3] = -1
-        attributes = {"POSITION": self.add(VERTICES), "JOINTS_0": self.add(joints), "WEIGHTS_0": self.add(weights)}
+        attributes = {"POSITION": self.add(VERTICES, **BOUNDS)}
+        attributes |= {"JOINTS_0": self.add(joints), "WEIGHTS_0": self.add(weights)}
         self.primitive = {"attributes": attributes, "indices": self.add(FACES.reshape(-1))}
         self.skin = {"joints": [1, 2], "inverseBindMatrices": self.add(above.swapaxes(1, 2).reshape(2, 16))}
         times, turns = self.add(np.array([0.0, 1, 2])), np.array([(0, 0, 0, 1), (0, 0, HALF, HALF), (0, 0, 0, 1)])
@@ -45,25 +47,8 @@ class Bar:
         self.nodes = [{"mesh": 0, "skin": 0, "translation": [9, 9, 9]}, {"children": [2]}, {"translation": [0, 1, 0]}]
         self.more = {}
 
-    def add(self, rows):
-        kind, number = {"f": (np.float32, 5126), "u": (rows.dtype, 5121 if rows.dtype.itemsize == 1 else 5123)}[
-            rows.dtype.kind
-        ]
-        content = rows.astype(kind).tobytes()
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)})
-        width = 1 if rows.ndim == 1 else rows.shape[1]
-        names = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-        accessor = {
-            "bufferView": len(self.views) - 1,
-            "componentType": number,
-            "count": len(rows),
-            "type": names[width],
-        }
-        if rows is VERTICES:
-            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        self.accessors.append(accessor)
-        self.data += content + bytes(-len(content) % 4)
-        return len(self.accessors) - 1
+    def add(self, rows, **more):
+        return stored(self.tree, rows.astype(np.float32) if rows.dtype.kind == "f" else rows, **more)
 
     def written(self, folder):
         tree = {
@@ -74,9 +59,7 @@ class Bar:
             "meshes": [{"primitives": [self.primitive]}],
             "skins": [self.skin],
             "animations": [self.clip],
-            "accessors": self.accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": len(self.data), "uri": "data:;base64," + base64.b64encode(self.data).decode()}],
+            **self.tree,
             **self.more,
         }
         path = folder / "bar.gltf"
@@ -141,11 +124,10 @@ def test_nodes_without_a_skin_carry_their_parts_and_morph_targets(bar, tmp_path)
 
 def test_displacements_of_morph_targets_may_be_sparse(bar, tmp_path):
     places, moved = np.array([2, 5], np.uint16), np.float32([(0, 0, 3), (1, 0, 0)])
-    bar.add(places), bar.add(moved)
-    first, second = ({"bufferView": len(bar.views) - n} for n in (2, 1))
+    first, second = ({"bufferView": viewed(bar.tree, x.tobytes())} for x in (places, moved))
     sparse = {"count": 2, "indices": {**first, "componentType": 5123}, "values": second}
-    bar.accessors.append({"componentType": 5126, "count": 6, "type": "VEC3", "sparse": sparse})
-    bar.primitive["targets"] = [{"POSITION": len(bar.accessors) - 1}]
+    bar.tree["accessors"].append({"componentType": 5126, "count": 6, "type": "VEC3", "sparse": sparse})
+    bar.primitive["targets"] = [{"POSITION": len(bar.tree["accessors"]) - 1}]
     model = rts.load_model(bar.written(tmp_path), weld=False)
     wanted = np.zeros((1, 6, 3))
     wanted[0, places] = moved
@@ -206,7 +188,7 @@ DAMAGES = {
     "weights of no targets": (lambda bar: bar.clip["channels"][0]["target"].update(path="weights"), "is of VEC4"),
     "a rotation of zero": (lambda bar: bar.sampler.update(output=bar.add(np.zeros((3, 4)))), "a rotation of length 0"),
     "sparse matrices": (
-        lambda bar: bar.accessors[bar.skin["inverseBindMatrices"]].update(sparse={}),
+        lambda bar: bar.tree["accessors"][bar.skin["inverseBindMatrices"]].update(sparse={}),
         "'count' is missing",
     ),
     "displacements of other rows": (
@@ -248,8 +230,7 @@ def test_missing_matrices_are_the_identity(bar, tmp_path):
 @pytest.mark.filterwarnings("ignore:.*faces have the corners of another one")
 def test_vertices_that_coincide_are_welded_only_if_they_move_alike(bar, tmp_path):
     twice = np.concatenate([VERTICES, VERTICES])
-    bar.primitive["attributes"] = {"POSITION": bar.add(twice)}
-    bar.accessors[-1] |= {"min": [0, 0, 0], "max": [1, 2, 0]}
+    bar.primitive["attributes"] = {"POSITION": bar.add(twice, **BOUNDS)}
     bar.primitive["indices"] = bar.add(np.concatenate([FACES, FACES + 6]).reshape(-1))
     moves = np.zeros((12, 3), np.float32)
     moves[6] = 1

@@ -142,28 +142,7 @@ LINES = {
     "quoted": (lambda line: [f'"{line}"'], {}),
     "escape": (lambda line: ["\x1b[0m" + line], {}),
 }
-KEYS = (
-    "F",
-    "ff",
-    "f1",
-    "fv",
-    "V",
-    "VV",
-    "vv",
-    "f:",
-    "f,",
-    "f/",
-    "vf",
-    "fn",
-    "ft",
-    "v1",
-    "v:",
-    "Vt",
-    "VN",
-    "vtt",
-    "n",
-    "nv",
-)
+KEYS = "F ff f1 fv V VV vv f: f, f/ vf fn ft v1 v: Vt VN vtt n nv".split()
 KEYS += ("-", "1", "0.5", "f_", "\u0192", "\uff46", "\u00a0f", "f\u00a0", "fo", "v.", "face", "vertex", "poly", "//")
 STL_WORDS = {
     "vertex": ("vertx", "vertexx", "Vertex", "vertex1", "", "vertex vertex", "vertex:"),

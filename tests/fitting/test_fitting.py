@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, crooked_box, mesh_part, to_numpy
+from helpers import DIFFERENTIABLE, arrays, crooked_box, mesh_part, refused, to_numpy
 from linear_problem import MATRIX, SOLUTION, joined, line
 
 import rts
@@ -265,16 +265,12 @@ def test_an_older_error_is_not_taken_for_a_new_one():
         ({"tolerance": None}, "tolerance is None"),
         ({"patience": 0}, "patience is 0"),
         ({"method": "lm", "loss": lambda r: r.sum()}, "takes no loss but an rts.Loss"),
-        ({"loss": "huber"}, "loss is 'huber'; expected a function of the residuals, such as rts.Loss"),
-        ({"loss": lambda r: r}, r"loss gave an array of shape \(3,\); expected a \w+ scalar"),
-        ({"loss": lambda r: 1.0}, "loss gave a float; expected"),
-        ({"loss": lambda r: None}, "loss gave None"),
+        ({"callback": "print"}, "callback is 'print'; expected a function of step, parameters and loss, or None"),
     ],
 )
 def test_wrong_options(target, options, expected):
-    with pytest.raises(InputError, match=expected) as error:
+    with refused(expected):
         rts.fit(lambda p: p, arrays(target, np.ones(3)), **options)
-    assert "\n" not in str(error.value)
 
 
 @targets
@@ -291,12 +287,13 @@ def test_wrong_options(target, options, expected):
     ],
 )
 def test_residuals_that_are_none(target, method, result, expected):
-    with pytest.raises(InputError, match=expected) as error:
+    with refused(expected):
         rts.fit(result, arrays(target, np.ones(3)), method=method)
-    assert "\n" not in str(error.value)
 
 
-def test_residuals_of_another_engine():
+def test_residuals_of_another_engine_or_of_none():
+    with pytest.raises(InputError, match="residuals is 'mask.png'; expected a function of the parameters"):
+        rts.fit("mask.png", _torch().ones(2))
     torch, jax = _torch(), pytest.importorskip("jax")
     with pytest.raises(InputError, match="expected one torch array"):
         rts.fit(lambda p: jax.numpy.ones(2), torch.ones(2))
@@ -349,11 +346,7 @@ def silhouette_residuals(target, splatter):
 
 @pytest.mark.parametrize(
     ("target", "method", "options"),
-    [
-        ("torch-cpu", "lm", {}),
-        ("torch-cpu", "adam", {"steps": 250, "learning_rate": 0.01}),
-        ("jax", "lm", {}),
-    ],
+    [("torch-cpu", "lm", {}), ("torch-cpu", "adam", {"steps": 250, "learning_rate": 0.01}), ("jax", "lm", {})],
 )
 def test_a_pose_is_recovered_from_a_silhouette(target, method, options):
     residuals, start = silhouette_residuals(target, "single"), arrays(target, np.zeros(6))

@@ -1,7 +1,5 @@
 """Schedules of fits: sizes of stages, what targets and weights become, and fits that a schedule leads home."""
 
-import warnings
-
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, box, quad, to_numpy
@@ -112,11 +110,9 @@ def test_a_stage_sees_what_the_whole_image_sees(channels, aspect):
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=45, aspect=aspect)
     weights = np.ones((*size, channels), np.float32)
     whole = turned(size, channels=channels, camera=camera, weights=weights, background=np.zeros((*size, 4), np.float32))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        stage = whole.at_stage(rts.Stage(0.2, supersample=6))
-        assert stage.size == (11, 9) and stage.supersample == 6
-        found = np.abs(stage(POSE))
+    stage = whole.at_stage(rts.Stage(0.2, supersample=6))  # Warnings are errors.
+    assert stage.size == (11, 9) and stage.supersample == 6
+    found = np.abs(stage(POSE))
     assert found.shape == ((11, 9) if channels == 1 else (11, 9, channels))
     # Of coarse pixels a point-sampled outline is off by a fifth of one; half a pixel of shift would be twice as much.
     assert found.max() < 0.2 and found.mean() < 0.015

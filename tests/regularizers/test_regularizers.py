@@ -16,6 +16,7 @@ from helpers import (
     finite_difference,
     gradient,
     icosphere,
+    precision,
     rotation,
     to_numpy,
 )
@@ -44,15 +45,8 @@ every_energy = pytest.mark.parametrize("energy", ENERGIES.values(), ids=ENERGIES
 
 @pytest.fixture(autouse=True, scope="module")
 def jax_in_double_precision():
-    if importlib.util.find_spec("jax") is None:
+    with precision("jax" if importlib.util.find_spec("jax") else "numpy"):
         yield
-        return
-    import jax
-
-    before = jax.config.jax_enable_x64
-    jax.config.update("jax_enable_x64", True)
-    yield
-    jax.config.update("jax_enable_x64", before)
 
 
 def grid(rows=5, columns=6, seed=None):

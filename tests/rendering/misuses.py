@@ -152,18 +152,7 @@ def of_views(**options):
 
 
 OPERATION = "name", "specification", "ranks", "shape", "forward", "push", "pull", "differentiable", "packed", "keeps"
-RENDERED = (
-    "parts",
-    "cameras",
-    "size",
-    "sampler",
-    "splatter",
-    "layers",
-    "supersample",
-    "background",
-    "capacity",
-    "engine",
-)
+RENDERED = "parts cameras size sampler splatter layers supersample background capacity engine".split()
 
 
 def open_in(function, *names, **fixed):
@@ -216,19 +205,7 @@ GROUPS = {
     ),
     "ViewResiduals": open_in(
         of_views,
-        *(
-            "scene",
-            "views",
-            "batch",
-            "window",
-            "seed",
-            "cameras",
-            "exposure",
-            "weights",
-            "target",
-            "unreadable",
-            "memory",
-        ),
+        *"scene views batch window seed cameras exposure weights target unreadable memory".split(),
         *("background", "sampler", "splatter", "layers", "supersample", "capacity", "channels", "loss", "f_scale"),
     ),
     "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
@@ -239,16 +216,7 @@ GROUPS = {
     ),
     "fit": open_in(
         lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o),
-        *(
-            "progress",
-            "jit",
-            "method",
-            "learning_rate",
-            "validation",
-            "validate_every",
-            "checkpoint",
-            "checkpoint_every",
-        ),
+        *"progress jit method learning_rate validation validate_every checkpoint checkpoint_every".split(),
     ),
     "gradient": {"points": lambda v: gradient(lambda p: p[:, 0], v)},
     "gradient_image": {
@@ -270,8 +238,7 @@ GROUPS = {
     "program": {"f": rts.program},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},
     "render_views": open_in(
-        lambda **o: rts.render_views(**{"parts": PART, "cameras": [CAMERA] * 2, "size": SIZE, **o}),
-        *RENDERED,
+        lambda **o: rts.render_views(**{"parts": PART, "cameras": [CAMERA] * 2, "size": SIZE, **o}), *RENDERED
     ),
     "sample": open_in(
         lambda **o: rts.sample(**{"parts": PART, "camera": CAMERA, "size": SIZE, "splatter": None, **o}),

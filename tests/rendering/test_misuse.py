@@ -7,6 +7,7 @@ from inspect import isabstract
 import misuses
 import numpy as np
 import pytest
+from helpers import refused
 
 import rts
 import rts_compare
@@ -429,26 +430,27 @@ def test_arrays_of_two_engines_are_refused():
     torch, jnp = pytest.importorskip("torch"), pytest.importorskip("jax.numpy")
     part, points = theta(vertices=torch.tensor(PART.theta["vertices"])), torch.zeros(4, 3)
     eye, ndc = jnp.eye(4), rts.Ndc((1.0, 1.0))
+    sampled = rts.sample(part, CAMERA, SIZE)
     for call in (
+        lambda: rts.render(part.replace(theta={**part.theta, "colors": jnp.ones((12, 3))}), CAMERA, SIZE),
         lambda: rts.render(part.replace(transform=eye), CAMERA, SIZE),
         lambda: rts.render(part, Camera(eye, CAMERA.projection), SIZE),
         lambda: rts.render(part, CAMERA, SIZE, background=eye[0, :3]),
         lambda: rts.render_samples(SAMPLED, part.replace(transform=eye), CAMERA),
+        lambda: rts.render_samples(sampled, PART.replace(transform=eye), CAMERA),
         lambda: rts.render_views(part.replace(transform=eye), [CAMERA] * 2, SIZE),
         lambda: rts.sample(part.replace(transform=eye), CAMERA, SIZE),
         lambda: combine(points, np.zeros((1, 1), np.int32), eye[:1, :1]),
         lambda: rts.rigid(torch.zeros(6), eye[0, :3]),
         lambda: CAMERA.replace(view=eye).project(points, SIZE),
         lambda: ndc.rays(points, jnp.ones((4, 3))),
-        lambda: misuses.DOUBLE(points, eye),
         lambda: rts.namespace(points, eye),
         lambda: rts.engine_of(points, {"a": eye}),
         lambda: rts.fit(lambda p: p["a"], {"a": points, "b": eye}),
         lambda: rts.check_gradient(lambda p: (part, CAMERA), {"a": points, "b": eye}, SIZE),
     ):
-        with pytest.raises(rts.RtsError) as refused:
+        with pytest.raises(rts.errors.EngineError, match="^arrays of jax and torch .*convert one side.*\\)$"):
             call()
-        assert "\n" not in str(refused.value)
 
 
 def flat(**changes):
@@ -522,9 +524,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_told_before_any_work(fault):
     call, words = FAULTS[fault]
-    with pytest.raises(rts.InputError, match=words) as refused:
+    with refused(words):
         call()
-    assert "\n" not in str(refused.value)
 
 
 def test_what_may_be_left_out_is():

@@ -26,6 +26,12 @@ def torch_with_programs():
     return torch
 
 
+def listing():
+    """A list, and a backend of torch that runs programs as they are and puts them there."""
+    programs = []
+    return programs, lambda graph, inputs: programs.append(graph) or graph
+
+
 def engine_arrays(name, tree):
     if name == "numpy":
         return tree
@@ -80,11 +86,7 @@ def test_jax_compiles_the_function():
 
 @pytest.mark.thorough
 def test_torch_makes_one_program_of_any_number_of_samples():
-    torch, programs = torch_with_programs(), []
-
-    def backend(graph, inputs):
-        programs.append(graph)
-        return graph
+    torch, (programs, backend) = torch_with_programs(), listing()
 
     # A part and a camera among the arguments, and a tree for a result.
     f = rts.program(lambda *args: {"loss": loss(*args), "image": image(*args)}, backend=backend)
@@ -101,11 +103,7 @@ def test_torch_makes_one_program_of_any_number_of_samples():
 
 
 def test_torch_makes_a_program_for_each_kind_of_arguments():
-    torch, programs = torch_with_programs(), []
-
-    def backend(graph, inputs):
-        programs.append(graph)
-        return graph
+    torch, (programs, backend) = torch_with_programs(), listing()
 
     f = rts.program(lambda x, sampled, factor: factor * x * sampled.samples[0].params.sum(), backend=backend)
     all_samples = [samples(arrays_of("torch", pose), PART) for pose in POSES]
@@ -135,11 +133,7 @@ def test_torch_makes_a_program_for_each_kind_of_arguments():
 
 def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
     """A stencil with as many entries of motions as of colours, and others."""
-    torch, programs = torch_with_programs(), []
-
-    def backend(graph, inputs):
-        programs.append(graph)
-        return graph
+    torch, (programs, backend) = torch_with_programs(), listing()
 
     def total(sampled):
         return (sampled.stencil.color_weight**2).sum() + (sampled.stencil.motion_weight**2).sum()
@@ -159,13 +153,8 @@ def test_torch_compiles_once_for_lengths_that_are_equal_at_first():
 
 
 def test_torch_tells_values_that_are_no_tensors_apart():
-    torch = torch_with_programs()
-    programs, x = [], torch.ones(2, dtype=torch.int64)
-
-    def backend(graph, inputs):
-        programs.append(graph)
-        return graph
-
+    torch, (programs, backend) = torch_with_programs(), listing()
+    x = torch.ones(2, dtype=torch.int64)
     f = rts.program(lambda tree, k: tree["x"] * k, backend=backend, dynamic=True)
     assert f({"x": x}, 2).dtype == torch.int64 and f({"x": x}, 2.0).dtype == torch.float32
     assert len(programs) == 2

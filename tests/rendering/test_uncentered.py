@@ -145,12 +145,7 @@ def test_derivatives_are_not_called_unknown():
     def scene(parameters):
         return Part(Ball(2), {"radius": parameters["radius"]}, "normals"), CAMERA
 
-    report = rts.check_gradient(
-        scene,
-        {"radius": torch.tensor(RADIUS)},
-        SIZE,
-        loss=lambda image: image[..., 3].mean(),
-    )
+    report = rts.check_gradient(scene, {"radius": torch.tensor(RADIUS)}, SIZE, loss=lambda image: image[..., 3].mean())
     print(report)
     assert "unknown" not in str(report)
 

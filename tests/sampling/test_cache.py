@@ -275,6 +275,22 @@ def test_structures_go_with_their_surface(name):
     assert not len(sampler._keeper._entries)
 
 
+def test_what_embree_holds_is_released_with_the_surface(monkeypatch):
+    sampler = counting("embree")
+    from rts_backends.embree import library
+
+    released, release = [], library._release
+    monkeypatch.setattr(library, "_release", lambda *given: released.append(given) or release(*given))
+    part = part_of(*icosphere(1))
+    for scale in (1.0, 0.9, 0.8, 0.7):
+        theta = {"vertices": part.theta["vertices"] * np.float32(scale)}
+        rts.render(part.replace(theta=theta), CAMERA, SIZE, sampler=sampler)
+    assert not released and len(sampler.prepared) == KEPT
+    del part
+    gc.collect()
+    assert len(released) == KEPT
+
+
 @pytest.mark.parametrize("name", PREPARING)
 def test_structures_go_with_their_sampler(name):
     sampler, part = counting(name), part_of(*icosphere(1))
@@ -321,11 +337,7 @@ def test_a_prepared_part_takes_other_shaders_and_theta_but_no_other_surface():
     colors = np.random.default_rng(0).uniform(size=vertices.shape).astype(np.float32)
     part = Part(Mesh(faces), {"vertices": vertices, "colors": colors}, "unlit")
     handle = rts.prepare(part, "raster")
-    for changes in (
-        {"shader": "normals"},
-        {"theta": {"vertices": vertices, "colors": 1 - colors}},
-        {"cull": "back"},
-    ):
+    for changes in ({"shader": "normals"}, {"theta": {"vertices": vertices, "colors": 1 - colors}}, {"cull": "back"}):
         found = rts.render(handle.replace(**changes), CAMERA, SIZE)
         np.testing.assert_array_equal(found, rts.render(part.replace(**changes), CAMERA, SIZE, sampler="raster"))
     with pytest.raises(InputError, match="rts.prepare"):
@@ -455,32 +467,35 @@ def differentiable_camera():
     return CAMERA.map(lambda m: torch.as_tensor(np.asarray(m, np.float32)))
 
 
-def test_what_has_no_triangles_goes_to_rays(few):
-    part = Part(Ellipsoid(), {"center": np.zeros(3, np.float32), "radii": np.ones(3, np.float32)})
-    (choice,) = rts.explain(part, CAMERA)
-    assert choice.sampler == "rays" and "no triangles" in choice.reason and "Ellipsoid" in choice.reason
+ELLIPSOID = Part(Ellipsoid(), {"center": np.zeros(3, np.float32), "radii": np.ones(3, np.float32)}, "normals")
+CHOICES = {
+    "no triangles": (lambda: (ELLIPSOID, CAMERA), "rays", ("no triangles", "Ellipsoid")),
+    "many that stay": (lambda: (part_of(*icosphere(1)), differentiable_camera()), "embree", ("80 triangles",)),
+    "few": (lambda: (part_of(*icosphere(0)), differentiable_camera()), "raster", ("20 triangles", "80")),
+    "may move": (
+        lambda: (part_of(arrays("torch-cpu", icosphere(1)[0]), icosphere(1)[1]), differentiable_camera()),
+        "raster",
+        ("may change",),
+    ),
+    "one render of NumPy": (lambda: (part_of(*icosphere(1)), CAMERA), "raster", ("may change",)),
+}
 
 
-def test_many_triangles_that_stay_go_to_embree(few):
-    sampler_class("embree")
-    (choice,) = rts.explain(part_of(*icosphere(1)), differentiable_camera())
-    assert choice.sampler == "embree" and "80 triangles" in choice.reason
-
-
-def test_few_triangles_go_to_raster(few):
-    (choice,) = rts.explain(part_of(*icosphere(0)), differentiable_camera())
-    assert choice.sampler == "raster" and "20 triangles" in choice.reason and "80" in choice.reason
-
-
-def test_triangles_that_may_move_go_to_raster(few):
-    vertices, faces = icosphere(1)
-    (choice,) = rts.explain(part_of(arrays("torch-cpu", vertices), faces), differentiable_camera())
-    assert choice.sampler == "raster" and "may change" in choice.reason
-
-
-def test_one_render_of_numpy_alone_goes_to_raster(few):
-    (choice,) = rts.explain(part_of(*icosphere(1)), CAMERA)
-    assert choice.sampler == "raster"
+@pytest.mark.parametrize("name", CHOICES)
+def test_auto_chooses_by_triangles_and_what_moves_says_why_and_renders_so(few, name, caplog):
+    given, sampler, words = CHOICES[name]
+    part, camera = given()
+    sampler_class(sampler)
+    (choice,) = rts.explain(part, camera)
+    assert choice.sampler == sampler and all(word in choice.reason for word in words)
+    with caplog.at_level(logging.DEBUG, logger="rts"):
+        image = rts.render(part, camera, SIZE)
+    assert f"{sampler} for {part.surface!r}: {choice.reason}" in caplog.text
+    assert all(record.levelno == logging.DEBUG for record in caplog.records)
+    expected = rts.render(part, camera, SIZE, sampler="rays" if sampler == "rays" else "raster")
+    np.testing.assert_allclose(to_numpy(image), to_numpy(expected), atol=1e-5 if sampler == "embree" else 0)
+    both = rts.explain([part_of(*icosphere(0)), part], camera)
+    assert [c.sampler for c in both] == ["raster", sampler]
 
 
 def test_without_embree_raster_serves_and_the_reason_says_so(few, monkeypatch):
@@ -514,29 +529,6 @@ def test_prepared_parts_are_explained_by_the_sampler_that_they_have(few):
         assert [c.sampler for c in choices] == names and "prepared" in choices[0].reason
     own = sampler_class("reference")()
     assert rts.explain(rts.prepare(parts[0], own), CAMERA)[0].sampler == type(own).__name__
-
-
-def test_each_part_is_explained_in_order(few):
-    ellipsoid = Part(Ellipsoid(), {"center": np.zeros(3, np.float32), "radii": np.ones(3, np.float32)})
-    choices = rts.explain([part_of(*icosphere(0)), ellipsoid], CAMERA)
-    assert [c.sampler for c in choices] == ["raster", "rays"]
-
-
-def test_the_choice_is_logged_for_debugging(few, caplog):
-    with caplog.at_level(logging.DEBUG, logger="rts"):
-        image = rts.render(part_of(*icosphere(1)), CAMERA, SIZE)
-    assert "raster for Mesh(80 faces): its triangles may change" in caplog.text
-    assert all(record.levelno == logging.DEBUG for record in caplog.records)
-    np.testing.assert_array_equal(image, rts.render(part_of(*icosphere(1)), CAMERA, SIZE, sampler="raster"))
-
-
-def test_auto_renders_with_what_it_explains(few, caplog):
-    sampler_class("embree")
-    part, camera = part_of(*icosphere(1)), differentiable_camera()
-    with caplog.at_level(logging.DEBUG, logger="rts"):
-        image = rts.render(part, camera, SIZE, sampler="auto")
-    assert "embree for Mesh(80 faces)" in caplog.text
-    np.testing.assert_allclose(image, rts.render(part, camera, SIZE, sampler="raster"), atol=1e-5)
 
 
 # --------------------------------------------------------------------------------------------- fingerprints
@@ -628,35 +620,3 @@ def test_a_render_of_a_handle_warns_of_vertices_that_have_changed(kind):
     for call in (draw, lambda: rts.render(handle, CAMERA, SIZE)):
         with pytest.warns(rts.errors.InputWarning, match="vertices of part 0 have changed since rts.prepare"):
             call()
-
-
-def test_scenes_of_embree_are_released_with_their_surface(monkeypatch):
-    sampler = counting("embree")
-    from rts_backends.embree import library as embree_library
-
-    released, release = [], embree_library._release
-
-    def record(*args):
-        released.append(args)
-        release(*args)
-
-    monkeypatch.setattr(embree_library, "_release", record)
-    part = part_of(*icosphere(1))
-    for scale in (1.0, 0.9, 0.8, 0.7):
-        theta = {"vertices": part.theta["vertices"] * np.float32(scale)}
-        rts.render(part.replace(theta=theta), CAMERA, SIZE, sampler=sampler)
-    assert not released and len(sampler.prepared) == KEPT
-    del part
-    gc.collect()
-    assert len(released) == KEPT
-
-
-def test_a_fingerprint_changes_with_the_order():
-    data = np.arange(64, dtype=np.float64)
-    seen = {fingerprint(data)}
-    for i in range(64):
-        for j in range(i + 1, 64):
-            swapped = data.copy()
-            swapped[[i, j]] = swapped[[j, i]]
-            seen.add(fingerprint(swapped))
-    assert len(seen) == 1 + 64 * 63 // 2

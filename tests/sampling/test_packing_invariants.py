@@ -170,20 +170,3 @@ def test_repacking_gives_kept_cells_their_rows_in_reading_order_and_counts_the_o
     unused = np.setdiff1d(np.arange(rows), found.row)
     for values in (found.ids, found.params, found.tables["own"]):
         assert len(values) == rows and not values[unused].any()
-
-
-@PROPERTIES
-@given(packed())
-def test_repacking_again_changes_nothing(given):
-    samples, kept, capacity = given
-    once = repack(samples, kept, capacity)
-    assert_same(repack(once, once.row >= 0, capacity), once)
-
-
-@PROPERTIES
-@given(packed(), st.data())
-def test_dropping_some_cells_and_then_others_is_dropping_all_at_once(given, data):
-    samples, kept, capacity = given
-    others = data.draw(masks(kept.shape))
-    both = repack(samples, kept & others, capacity)
-    assert_same(repack(repack(samples, kept, None), kept & others, capacity), both)

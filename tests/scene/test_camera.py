@@ -13,7 +13,7 @@ from helpers import (
     derivative,
     finite_difference,
     gradient,
-    moved,
+    refused,
     rigid,
     rotation,
     to_numpy,
@@ -186,15 +186,6 @@ def test_points_on_the_plane_of_the_camera_project_to_finite_values_with_depth_z
     assert np.isfinite((x, y)).all() and depth == 0
 
 
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-def test_within_a_transform_sees_local_points_where_the_camera_sees_the_moved_ones(camera):
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    transform = rigid((1, 2, 3), 50, (0.3, 0.2, -0.1)) @ np.diag([2.0, 0.5, -1.0, 1.0])
-    found = camera.within(transform).project(points, SIZE)
-    np.testing.assert_allclose(found, camera.project(moved(transform, points), SIZE), atol=1e-9)
-    assert camera.within(None) is camera
-
-
 # ---------------------------------------------------------------------------------------------- converters
 
 
@@ -264,94 +255,33 @@ def test_blender_camera_looks_along_its_minus_z_with_focal_in_pixels(rows):
 
 # --------------------------------------------------------------------------------------------- derivatives
 
+PLACE = {"eye": (1.0, 2.0, 5.0), "target": (0.1, 0.2, 0.3), "up": (0.1, 1.0, 0.2)}
+PLANES = {"near": 0.5, "far": 9.0}
+IMAGE = {"aspect": 1.5, "principal_point": (0.1, 0.2), **PLANES}
+POSE = rigid((1, 2, 3), 40, (0.1, 0.2, 6.0))
+MATRICES = {"modelview": POSE, "projection": perspective(50.0, 1.5, 0.5, 9.0)}
 CONSTRUCTORS = {
-    "look_at": (
-        lambda a: Camera.look_at(
-            a["eye"],
-            a["target"],
-            a["up"],
-            fov_y=a["fov_y"],
-            aspect=a["aspect"],
-            near=a["near"],
-            far=a["far"],
-            principal_point=a["point"],
-        ),
-        {
-            "eye": (1.0, 2.0, 5.0),
-            "target": (0.1, 0.2, 0.3),
-            "up": (0.1, 1.0, 0.2),
-            "fov_y": 50.0,
-            "aspect": 1.5,
-            "near": 0.5,
-            "far": 9.0,
-            "point": (0.1, 0.2),
-        },
-    ),
+    "look_at": (lambda a: Camera.look_at(**a), {**PLACE, **IMAGE, "fov_y": 50.0}),
     "look_at, default planes": (
-        lambda a: Camera.look_at(a["eye"], a["target"]).for_size((20, 30)),
-        {"eye": (1.0, 2.0, 5.0), "target": (0.1, 0.2, 0.3)},
+        lambda a: Camera.look_at(**a).for_size((20, 30)),
+        {"eye": PLACE["eye"], "target": PLACE["target"]},
     ),
-    "orthographic": (
-        lambda a: Camera.orthographic(
-            a["eye"],
-            a["target"],
-            a["up"],
-            height=a["height"],
-            aspect=a["aspect"],
-            near=a["near"],
-            far=a["far"],
-            principal_point=a["point"],
-        ),
-        {
-            "eye": (1.0, 2.0, 5.0),
-            "target": (0.1, 0.2, 0.3),
-            "up": (0.1, 1.0, 0.2),
-            "height": 3.0,
-            "aspect": 1.5,
-            "near": 0.5,
-            "far": 9.0,
-            "point": (0.1, 0.2),
-        },
-    ),
+    "orthographic": (lambda a: Camera.orthographic(**a), {**PLACE, **IMAGE, "height": 3.0}),
     "from_opencv": (
-        lambda a: Camera.from_opencv(a["K"], a["R"], a["t"], SIZE, near=a["near"], far=a["far"]),
-        {"K": SKEWED_K, "R": rotation((1, 2, 3), 40), "t": (0.1, 0.2, 6.0), "near": 0.5, "far": 9.0},
+        lambda a: Camera.from_opencv(**a, size=SIZE),
+        {"K": SKEWED_K, "R": POSE[:3, :3], "t": (0.1, 0.2, 6.0), **PLANES},
     ),
     "from_mvp": (
-        lambda a: Camera.from_mvp(a["matrix"]),
+        lambda a: Camera.from_mvp(**a),
         {"matrix": CAMERAS["off-centre"].projection @ CAMERAS["off-centre"].view},
     ),
-    "from_opengl": (
-        lambda a: Camera.from_opengl(a["modelview"], a["projection"]),
-        {"modelview": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "projection": perspective(50.0, 1.5, 0.5, 9.0)},
-    ),
-    "from_nvdiffrast": (
-        lambda a: Camera.from_nvdiffrast(a["modelview"], a["projection"], top_down=True),
-        {"modelview": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "projection": perspective(50.0, 1.5, 0.5, 9.0)},
-    ),
+    "from_opengl": (lambda a: Camera.from_opengl(**a), MATRICES),
+    "from_nvdiffrast": (lambda a: Camera.from_nvdiffrast(**a, top_down=True), MATRICES),
     "from_pytorch3d": (
-        lambda a: Camera.from_pytorch3d(
-            a["R"],
-            a["T"],
-            focal_length=a["focal"],
-            principal_point=a["point"],
-            size=SIZE,
-            near=a["near"],
-            far=a["far"],
-        ),
-        {
-            "R": rotation((1, 2, 3), 40),
-            "T": (0.1, 0.2, 6.0),
-            "focal": (3.0, 2.0),
-            "point": (0.1, -0.2),
-            "near": 0.5,
-            "far": 9.0,
-        },
+        lambda a: Camera.from_pytorch3d(**a, size=SIZE),
+        {"R": POSE[:3, :3], "T": (0.1, 0.2, 6.0), "focal_length": (3.0, 2.0), "principal_point": (0.1, -0.2), **PLANES},
     ),
-    "from_blender": (
-        lambda a: Camera.from_blender(a["camera_to_world"], SIZE, focal=a["focal"], near=a["near"], far=a["far"]),
-        {"camera_to_world": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "focal": 50.0, "near": 0.5, "far": 9.0},
-    ),
+    "from_blender": (lambda a: Camera.from_blender(**a, size=SIZE), {"camera_to_world": POSE, "focal": 50.0, **PLANES}),
 }
 VIEW_WEIGHTS, PROJECTION_WEIGHTS = np.random.default_rng(0).normal(size=(2, 4, 4))
 
@@ -431,11 +361,9 @@ def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
         (lambda: perspective(45, 1, 2.0, 1.0), ("near", "2.0", "far")),
         (lambda: perspective(45, 1, 1.0, 1.0), ("near < far",)),
         (lambda: perspective(45, 1, 0.0, 1.0), ("near > 0",)),
-        (lambda: perspective(45, 1, -1.0, 1.0), ("near > 0",)),
         (lambda: perspective(45, 1, 0.1, float("inf")), ("finite",)),
         (lambda: perspective(45, 1, float("nan"), 1.0), ("finite",)),
         (lambda: perspective(0), ("fov_y", "degrees")),
-        (lambda: perspective(180), ("fov_y", "180")),
         (lambda: perspective(-30), ("fov_y", "-30")),
         (lambda: orthographic(0), ("height", "positive")),
         (lambda: orthographic(2, 1, 3.0, 2.0), ("near", "far")),
@@ -443,28 +371,7 @@ def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
         (lambda: look_at((0, 5, 0), (0, 0, 1), (0, 0, 0)), ("upright",)),
         (lambda: look_at((0, 5), (0, 0, 0)), ("eye has shape (2,)", "expected (3,)")),
         (lambda: look_at((0, float("nan"), 1), (0, 0, 0)), ("eye", "nan", "finite")),
-        (lambda: Camera.look_at((0, 0, 5), (0, 0, 0), near=3, far=1), ("near < far",)),
-        (lambda: Camera.orthographic((0, 0, 5), (0, 0, 0), height=-1), ("height",)),
-        (
-            lambda: Camera.from_opencv(np.eye(4), np.eye(3), np.zeros(3), SIZE),
-            ("K has shape (4, 4)", "(3, 3)"),
-        ),
-        (
-            lambda: Camera.from_opencv(np.eye(3), np.eye(4), np.zeros(3), SIZE),
-            ("R has shape (4, 4)", "(3, 3)"),
-        ),
-        (lambda: Camera.from_opencv(np.eye(3), np.eye(3), np.zeros(4), SIZE), ("t has shape (4,)", "(3,)")),
         (lambda: Camera.from_opencv(np.eye(3), np.eye(3), np.zeros(3), SIZE, near=2, far=1), ("near < far",)),
-        (
-            lambda: Camera.from_pytorch3d(np.eye(4), np.zeros(3), focal_length=1.0, size=SIZE),
-            ("R has shape (4, 4)", "(3, 3)"),
-        ),
-        (
-            lambda: Camera.from_pytorch3d(np.eye(3), np.zeros(2), focal_length=1.0, size=SIZE),
-            ("T has shape (2,)", "(3,)"),
-        ),
-        (lambda: Camera.from_blender(np.eye(3), SIZE, focal=50.0), ("camera_to_world", "(3, 3)", "(4, 4)")),
-        (lambda: Camera.from_opengl(np.eye(3), np.eye(4)), ("modelview", "(3, 3)", "(4, 4)")),
         (lambda: Camera.from_nvdiffrast(np.eye(4), np.eye(3)), ("projection", "(3, 3)", "(4, 4)")),
     ],
 )
@@ -569,16 +476,6 @@ def test_from_mvp_of_depths_from_0_to_1_has_the_same_picture():
     found = Camera.from_mvp(PRODUCTS["depths from 0 to 1"] @ camera.view)
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
     np.testing.assert_allclose(found.project(points, SIZE), camera.project(points, SIZE), rtol=1e-9)
-
-
-def test_from_mvp_keeps_the_order_of_depth_of_a_clip_space_picture():
-    # Vertices in clip space, and z / w as a depth buffer has it: the golden order of what hides what.
-    camera = Camera.look_at((0.3, -2, 3), (0, 0, 0), (0, 0, 1), fov_y=35, aspect=1.5)
-    points = np.random.default_rng(1).uniform(-1, 1, (200, 3))
-    clip = np.concatenate([points, np.ones((200, 1))], axis=1) @ (camera.projection @ camera.view).T
-    depth = Camera.from_mvp(camera.projection @ camera.view).project(points, SIZE)[:, 2]
-    np.testing.assert_array_equal(np.argsort(depth), np.argsort(clip[:, 2] / clip[:, 3]))
-    np.testing.assert_allclose(depth, clip[:, 3], rtol=1e-9)
 
 
 @pytest.mark.parametrize("sampler", ["raster", "reference", "embree"])
@@ -760,9 +657,8 @@ NONSENSE = {
 @pytest.mark.parametrize("name", NONSENSE)
 def test_a_camera_of_nonsense_is_refused_of_numbers_and_of_arrays(name, target):
     make, message = NONSENSE[name]
-    with pytest.raises(InputError, match=message) as error:
+    with refused(message):
         make(lambda value: arrays(target, np.array(value)))
-    assert "\n" not in str(error.value)
 
 
 def test_complex_matrices_are_refused():

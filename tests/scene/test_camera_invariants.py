@@ -212,6 +212,7 @@ def test_within_a_transform_local_points_are_seen_where_the_moved_ones_are(scene
     camera, size, points, expected = scene
     local = moved(np.linalg.inv(transform), points)
     close(camera.within(transform).project(local, size), expected, 1e-6)
+    assert camera.within(None) is camera
 
 
 @PROPERTIES

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, rotation, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, gradient, rotation, to_numpy
 from scipy.spatial.transform import Rotation
 
 import rts
@@ -73,22 +73,6 @@ def test_rigid_is_the_identity_at_zero_with_its_derivatives(target):
     np.testing.assert_allclose(to_numpy(func.hessian(f)(zero)), hessian, atol=1e-5)
 
 
-def test_the_derivative_of_rigid_at_an_angle():
-    weights = np.random.default_rng(2).normal(size=(4, 4))
-    for angle in (0.03, 0.1, 0.5):
-        pose = np.array([0.6 * angle, 0, 0.8 * angle, 0.1, 0.2, 0.3])
-        tensor = torch.tensor(pose)
-
-        def f(p):
-            return (rts.rigid(p, (0.5, 0, 1)) * torch.as_tensor(weights)).sum()
-
-        numeric = finite_difference(lambda p: np.sum(rts.rigid(p, (0.5, 0, 1)) * weights), pose)
-        np.testing.assert_allclose(gradient("torch-cpu", f, tensor), numeric, atol=1e-8)
-        tangent = np.arange(6.0)
-        _, slope = derivative("torch-cpu", f, tensor, torch.tensor(tangent))
-        assert float(slope) == pytest.approx(numeric @ tangent, abs=1e-7)
-
-
 def test_rigid_turns_about_the_centre_and_takes_lists():
     center = np.array([1.0, -2.0, 0.5])
     matrix = rts.rigid([0, 0, 0.7, 0.1, 0.2, 0.3], center)
@@ -123,16 +107,6 @@ def test_float32_stays_float32():
     matrix.sum().backward()
     assert matrix.dtype == pose.grad.dtype == torch.float32
     torch.testing.assert_close(matrix, RIGID.specification(pose.detach(), torch.zeros(3)), rtol=0, atol=1e-6)
-
-
-def test_batches_of_derivatives():
-    poses = torch.tensor(list(POSES.values()), dtype=torch.float64)
-    center = torch.tensor(CENTER, dtype=torch.float64)
-    for transform in (torch.func.jacfwd, torch.func.jacrev, torch.func.hessian):
-        found, expected = (
-            torch.func.vmap(transform(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, RIGID.specification)
-        )
-        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("target", ALL)

@@ -250,13 +250,7 @@ def test_blinn_phong_without_specular_is_lambert():
 def test_blinn_phong_gradients_are_finite_at_grazing_light(target, degrees, shininess):
     camera = arrays(target, FRONT)
     given = arrays(
-        target,
-        {
-            "light": light(degrees),
-            "specular": np.full(3, 0.5),
-            "shininess": np.array(shininess),
-            "n": np.eye(3),
-        },
+        target, {"light": light(degrees), "specular": np.full(3, 0.5), "shininess": np.array(shininess), "n": np.eye(3)}
     )
 
     def f(tree):

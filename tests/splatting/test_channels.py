@@ -59,12 +59,7 @@ def test_each_channel_is_as_in_an_image_of_three(target, count):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"splatter": "none"},
-        {"splatter": "multi"},
-        {"splatter": "single", "supersample": 2},
-        {"supersample": 3},
-    ],
+    [{"splatter": "none"}, {"splatter": "multi"}, {"splatter": "single", "supersample": 2}, {"supersample": 3}],
     ids=str,
 )
 @pytest.mark.filterwarnings("ignore:samples are translucent")

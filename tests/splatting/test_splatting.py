@@ -4,16 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import (
-    ALL,
-    TORCH,
-    arrays,
-    derivative,
-    finite_difference,
-    gradient,
-    icosphere,
-    to_numpy,
-)
+from helpers import ALL, TORCH, arrays, derivative, finite_difference, gradient, icosphere, to_numpy
 
 import rts
 from rts.splatting import Multi, Plain, Single, exact_calibration
@@ -155,14 +146,17 @@ def test_two_cells_two_layers_by_hand(target):
 # --------------------------------------------------------------------------------------------- closed forms
 
 
-@pytest.mark.parametrize("sigma", [0.4, 0.5, 0.7])
-def test_the_exact_calibration_is_the_first_moment_of_the_kernels_derivative(sigma):
+@pytest.mark.parametrize("sigma, reach", [(0.4, 1), (0.5, 1), (0.7, 1), (0.8, 2), (1.5, 3)])
+def test_the_exact_calibration_is_the_first_moment_of_the_kernels_derivative(sigma, reach):
     # Moment of −u ∂w/∂P at P = c, by differences of the weights as written in the definition.
-    def weight(u, p):
-        return math.exp(-((u - p) ** 2) / (2 * sigma**2)) / sum(math.exp(-(i**2) / (2 * sigma**2)) for i in (-1, 0, 1))
+    cells = range(-reach, reach + 1)
 
-    moment = sum(u * (weight(u, 1e-6) - weight(u, -1e-6)) / 2e-6 for u in (-1, 0, 1))
-    assert exact_calibration(sigma) * moment == pytest.approx(1, abs=1e-8)
+    def weight(u, p):
+        return math.exp(-((u - p) ** 2) / (2 * sigma**2)) / sum(math.exp(-(i**2) / (2 * sigma**2)) for i in cells)
+
+    moment = sum(u * (weight(u, 1e-6) - weight(u, -1e-6)) / 2e-6 for u in cells)
+    assert exact_calibration(sigma, reach) * moment == pytest.approx(1, abs=1e-8)
+    assert exact_calibration(sigma) == exact_calibration(sigma, 1)
 
 
 @pytest.mark.parametrize("target", TORCH)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import helpers
 import numpy as np
 
 import rts
-from rts.contracts.records import Cells
-from rts.plugin_api.records import Samples
 from rts_surfaces.subdivision.binding import Limit, Rules
 from rts_surfaces.subdivision.cage_checks import checked_cage
 from rts_surfaces.subdivision.face_tiles import tiles_of
@@ -74,6 +73,5 @@ def somewhere(limit, count, seed=0, margin=0.0):
 
 
 def samples_at(face, params):
-    none = np.full((1, 1, 1), -1, np.int32)
-    ids = np.asarray(face, np.int32).reshape(-1, 1)
-    return Samples(ids, np.asarray(params, np.float32), Cells(none, none.astype(np.float32)), np.int32(0))
+    """Samples on faces (N,) in single precision, which no cell refers to."""
+    return helpers.samples_at(face, np.asarray(params, np.float32))

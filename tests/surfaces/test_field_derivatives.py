@@ -1,10 +1,8 @@
 """Derivatives of surfaces of fields: by several threads at once, in both modes, and of fields steep or flat there."""
 
-import threading
-
 import numpy as np
 import pytest
-from helpers import quick
+from helpers import quick, together
 
 import rts
 from rts import Camera, Part
@@ -43,24 +41,9 @@ def test_threads_at_once_find_the_images_and_gradients_of_one(name):
 
     expected = [found(i) for i in range(THREADS)]
     for _ in range(ROUNDS):
-        results, start = [None] * THREADS, threading.Barrier(THREADS)
-
-        def work(i, results=results, start=start):
-            start.wait(60)
-            try:
-                results[i] = found(i)
-            except Exception as error:
-                results[i] = error
-
-        threads = [threading.Thread(target=work, args=(i,)) for i in range(THREADS)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60)
-        for result, (image, gradient) in zip(results, expected, strict=True):
-            assert isinstance(result, tuple), result
-            np.testing.assert_array_equal(result[0], image)
-            np.testing.assert_array_equal(result[1], gradient)
+        for result, known in zip(together(found, THREADS), expected, strict=True):
+            for x, y in zip(result, known, strict=True):
+                np.testing.assert_array_equal(x, y)
 
 
 # --------------------------------------------------------------------------------------------------- both modes

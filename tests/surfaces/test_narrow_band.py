@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers import quick
+from helpers import quick, refused
 
-from rts import InputError
 from rts_surfaces.implicit.distinct_loops import distinct
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
@@ -354,9 +353,8 @@ BAD = {
 
 @pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in BAD.items() for v in values])
 def test_bad_arguments_are_refused(name, value):
-    with pytest.raises(InputError, match=name) as caught:
+    with refused(name):
         NarrowBand(**{name: value})
-    assert "\n" not in str(caught.value)
 
 
 def test_equal_bands_are_equal():

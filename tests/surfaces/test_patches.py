@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from example_surfaces import part_of
 from helpers import ALL, arrays, to_numpy
 from thin_patches import lacking, thin_patches
 
@@ -214,7 +215,7 @@ THIN = int(os.environ.get("RTS_THIN", "24"))
 @pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
 def test_no_pixel_lacks_the_sheet_in_front_where_patches_are_thin(name):
     if name == "subdivision":
-        example(name)
+        part_of(name)
     wrong, pixels = {}, 0
     for number in range(1, 1 + THIN // (1 if name == "bezier" else 4)):
         view = thin_patches(number, name)
@@ -275,17 +276,10 @@ def test_the_edge_of_a_flat_patch_is_as_fine_as_an_outline():
 NAMES = [*PARTS, "subdivision"]
 
 
-def example(name):
-    try:
-        return rts.plugin("surfaces", name).example()
-    except rts.errors.PluginError as missing:
-        pytest.skip(str(missing))
-
-
 @pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
 @pytest.mark.parametrize("scale", [(1e-3,) * 3, (1e3,) * 3, (1.0, 0.2, 1.0)])
 def test_triangles_are_as_fine_where_a_transform_scales(name, scale):
-    part, size = example(name), (150, 150)
+    part, size = part_of(name), (150, 150)
     camera = Camera.look_at((1.5, 1.8, 4.5), (0, 0, 0), fov_y=40)
     entry = "vertices" if name == "subdivision" else "points"
     points = part.theta[entry].astype(np.float64)
@@ -301,7 +295,7 @@ def test_triangles_are_as_fine_where_a_transform_scales(name, scale):
 
 @pytest.mark.parametrize("name", ["bezier", "subdivision"])
 def test_points_of_no_patch_do_not_count(name):
-    part = example(name)
+    part = part_of(name)
     entry = "points" if name == "bezier" else "vertices"
     more = {e: np.concatenate([part.theta[e], part.theta[e][:1] + 1e5]) for e in (entry, "colors")}
     camera, size = CAMERA.for_size((100, 100)), (100, 100)
@@ -312,7 +306,7 @@ def test_points_of_no_patch_do_not_count(name):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda part: pickle.loads(pickle.dumps(part))])
 def test_tables_of_copies_are_fixed_and_images_alike(name, copied):
-    part = example(name)
+    part = part_of(name)
     other = copied(part)
     for table in (*other.surface.tiles, *other.surface.whole):
         assert not table.flags.writeable

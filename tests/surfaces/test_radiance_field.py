@@ -13,13 +13,7 @@ from rts.testing import ShaderConformance, SurfaceConformance
 from rts_surfaces.radiance_field import lattice as lattices
 from rts_surfaces.radiance_field.chunks import in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
-from rts_surfaces.radiance_field.network import (
-    check_network,
-    density,
-    density_and_radiance,
-    encoding,
-    radiance,
-)
+from rts_surfaces.radiance_field.network import check_network, density, density_and_radiance, encoding, radiance
 from rts_surfaces.radiance_field.projected import Projected
 from rts_surfaces.radiance_field.shader import RadianceShader
 

@@ -1,6 +1,5 @@
 """Subdivision surfaces: against plain subdivision and its limit masks, their derivatives, attributes, files."""
 
-import copy
 import pickle
 
 import numpy as np
@@ -235,13 +234,6 @@ def test_a_face_varying_map_keeps_its_seam():
     np.testing.assert_allclose(
         smooth.limit.stencils(face, params, channel=UV).sum(axis=1), 1, atol=1e-12
     )  # Affine, whatever the rule.
-
-
-def test_copies_are_as_good():
-    part = Subdivision.example()
-    expected = rts.render(part, CAMERA, SIZE)
-    for again in (copy.deepcopy(part.surface), pickle.loads(pickle.dumps(part.surface))):
-        np.testing.assert_array_equal(rts.render(part.replace(surface=again), CAMERA, SIZE), expected)
 
 
 # ---------------------------------------------------------------------------------------------- files

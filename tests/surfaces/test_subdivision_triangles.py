@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cages import CAGES, limit_of, somewhere
+from helpers import open_edges
 from scipy.spatial import cKDTree
 
 import rts
@@ -24,13 +25,6 @@ cages = pytest.mark.parametrize("name", CAGES)
 
 
 # -------------------------------------------------------------------------------------------- triangles
-
-
-def open_edges(faces):
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    assert len(np.unique(directed, axis=0)) == len(directed)
-    edges, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
-    return edges[counts != 2]
 
 
 @cages

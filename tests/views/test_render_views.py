@@ -455,18 +455,6 @@ def test_a_pose_is_fitted_to_views_with_a_schedule():
     assert float(found.parameters.abs().max()) < 0.02, found.reason
 
 
-def test_as_many_targets_as_cameras_are_asked_for():
-    torch = pytest.importorskip("torch")
-    part = scene()[0]
-    for call in (lambda r: r(torch.zeros(6)), lambda r: r.normal_equations(torch.zeros(6))):
-        with pytest.raises(InputError, match="2 cameras.*3 views"):
-            call(rts.ImageResiduals(lambda p: part, CAMERAS[:2], SIZE, np.zeros((3, *SIZE))))
-    with pytest.raises(InputError, match="3 cameras for a target of one view"):
-        rts.ImageResiduals(lambda p: part, CAMERAS, SIZE, np.zeros(SIZE))(torch.zeros(6))
-    with pytest.raises(InputError, match="weights are of 2 views; expected 3"):
-        rts.ImageResiduals(lambda p: part, CAMERAS, SIZE, np.zeros((3, *SIZE)), weights=np.ones((2, *SIZE)))
-
-
 @pytest.mark.parametrize("target", ["numpy", *TORCH])
 def test_shaders_are_not_asked_where_a_part_is_out_of_sight(target):
     def shader(theta, gbuffer, camera):
