@@ -28,6 +28,24 @@ class Spacing(NamedTuple):
     step: tuple[float, ...]
 
 
+class Interpolated(NamedTuple):
+    """A field between the points of a lattice, as compiled loops take it.
+
+    Attributes:
+        values: (M,), of all lattice points, indexed by number, or of a band's points, indexed by row.
+        isovalue: see `marching_cubes.of_lattice`.
+        sign: see `marching_cubes.of_lattice`.
+        capped: whether the surface is closed at the bounds.
+        lattice: how its points lie.
+    """
+
+    values: np.ndarray
+    isovalue: float
+    sign: float
+    capped: bool
+    lattice: Spacing
+
+
 class Lattice:
     """X × Y × Z points from one corner of a box to the opposite one. Point (x, y, z) has the number (x Y + y) Z + z.
 
