@@ -48,16 +48,12 @@ def forward(table: np.ndarray, uv: np.ndarray, image: np.ndarray, out: np.ndarra
     _parallel(_look_up, _lookups(uv, image, **options), table, out)
 
 
-def push(
-    table: np.ndarray,
-    uv: np.ndarray,
-    image: np.ndarray,
-    t_table: np.ndarray | None,
-    t_uv: np.ndarray | None,
-    out: np.ndarray,
-    **options: Any,
-) -> None:
-    """Fill `out` (N, C) with the derivative along `t_table` (M, C) and `t_uv` (N, 2), each None if zero."""
+def push(table: np.ndarray, uv: np.ndarray, image: np.ndarray, *rest: Any, **options: Any) -> None:
+    """Fill the last of `rest`, out (N, C), with the derivative.
+
+    Before it are tangents of the table (M, C) and of uv (N, 2), each None if zero.
+    """
+    t_table, t_uv, out = rest
     if t_table is None:
         out[...] = 0
     else:
@@ -66,17 +62,9 @@ def push(
         _parallel(_add_moved, _lookups(uv, image, **options), table, t_uv, out)
 
 
-def pull(
-    table: np.ndarray,
-    uv: np.ndarray,
-    image: np.ndarray,
-    g: np.ndarray,
-    g_table: np.ndarray | None,
-    g_uv: np.ndarray | None,
-    **options: Any,
-) -> None:
-    """Pull back the gradient `g` (N, C) of the result: fill `g_table` and `g_uv`, given as zeros, unless None."""
-    lookups = _lookups(uv, image, **options)
+def pull(table: np.ndarray, uv: np.ndarray, image: np.ndarray, g: np.ndarray, *results: Any, **options: Any) -> None:
+    """Pull back the gradient `g` (N, C) of the result: fill `results`, of table and uv, given as zeros, unless None."""
+    (g_table, g_uv), lookups = results, _lookups(uv, image, **options)
     if g_table is not None:
         _scatter(lookups, g, g_table)
     if g_uv is not None and not lookups.nearest:
