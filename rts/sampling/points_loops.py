@@ -50,8 +50,7 @@ def hits(points, begins, order, rows, clip, keep, vertices, faces, found):
         found: `Fragments`: ids (K, M) int32, filled with −1; barycentrics (K, M, 2) float32, to fill; depths (K, M)
             float64, filled with infinity.
     """
-    ids, weights, depths = found
-    height, corners, box = len(begins) - 1, np.empty((3, 4)), np.empty(4)
+    (ids, weights, depths), height, corners, box = found, len(begins) - 1, np.empty((3, 4)), np.empty(4)
     for t in range(len(faces)):
         sign = corners_of(t, rows, vertices, faces, corners)
         if sign == 0 or sign * keep < 0:
