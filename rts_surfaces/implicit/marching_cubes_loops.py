@@ -73,6 +73,14 @@ def _mixed(codes, cells, found):
 
 
 @compiled
+def _room(shape, closed):
+    """Room for the signs of two planes, see `_signs`, and for the cases and the mixed cells of a row of cells."""
+    border = 2 if closed else 1
+    planes, cells = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8), shape[2] + border - 1
+    return planes, np.zeros((cells + 7) // 8 * 8, np.uint8), np.empty(cells, np.int64)
+
+
+@compiled
 def _crossed(code):
     """The crossed ones of the three edges that a cell owns, as bits 0 to 2 for x, y, z; from the cell's case `code`."""
     lowest = code & 1
@@ -100,11 +108,8 @@ def count(start, stop, levels, triangles_of, tally):
     """
     values, isovalue, sign, closed = levels
     shape = values.shape
-    border = 2 if closed else 1
-    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
-    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
-    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    mixed_places = np.empty(cells_z, np.int64)
+    planes, codes, mixed_places = _room(shape, closed)
+    cells_y, cells_z = planes.shape[1] - 1, len(mixed_places)
     first = -1 if closed else 0
     _signs(values, isovalue, sign, closed, start + first, planes[0])
     for x in range(start, stop):
@@ -133,14 +138,10 @@ def vertices(start, stop, levels, lattice, mixed, found):
         mixed: `Mixed`, of which all but `offsets` is to be filled.
         found: `Triangles`, of which `vertices`, `ends` and `differences` are to be filled.
     """
-    values, isovalue, sign, closed = levels
-    offsets, cells, codes_of, first_of = mixed
+    (values, isovalue, sign, closed), (offsets, cells, codes_of, first_of) = levels, mixed
     shape = values.shape
-    border = 2 if closed else 1
-    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
-    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
-    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    mixed_places = np.empty(cells_z, np.int64)
+    planes, codes, mixed_places = _room(shape, closed)
+    cells_y, cells_z = planes.shape[1] - 1, len(mixed_places)
     shift = 1 if closed else 0
     _signs(values, isovalue, sign, closed, start - shift, planes[0])
     for x in range(start, stop):

@@ -141,9 +141,8 @@ def outlines(start, stop, shapes, view, cone, wanted, allowed):
         wanted: (2,), the allowed distance in pixels where a tile may have an outline, and elsewhere.
         allowed: `tile_triangles.Allowed`.
     """
-    normals, places, bends, (chord, edge, facing) = shapes.normals, shapes.places, shapes.bends, allowed
-    eye, toward, axis, spread = view.eye, view.toward, view.axis, view.spread
-    parallel, aside, depth, (sine, cosine) = view.parallel, view.aside, view.along, cone
+    (normals, places, bends, _), (chord, edge, facing), (sine, cosine) = shapes, allowed, cone
+    eye, parallel, aside, depth, toward, spread, axis, _ = view
     grid, move = places.shape[1], aside + depth
     faces, way, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
     for t in range(start, stop):
