@@ -189,7 +189,7 @@ def keep_nearest_address() -> int:
     return _compiled_filter().address
 
 
-class Cast(NamedTuple):
+class Target(NamedTuple):
     """What rays are cast at.
 
     Attributes:
@@ -235,21 +235,21 @@ class Eye(NamedTuple):
 
 
 @loop
-def cast(first, last, at, eye, points, fragments):
+def cast(first, last, target, eye, points, fragments):
     """Fill the fragment arrays for tiles of pixels, or for pieces of the list `points`.
 
     Args:
         first: first tile or piece, of TILE² pixels.
         last: the tile or piece past the last.
-        at: `Cast`.
+        target: `Target`.
         eye: `Eye`.
         points: (M, 2) x and y of the positions to cast rays through; empty for all H · W pixels' centres.
         fragments: `Fragments` to fill: ids, barycentrics and depths of K layers, one point or pixel after the other.
     """
-    intersect, filter_address, scene, object_sphere, vertices, faces, owners, margins = at
+    intersect, filter_address, scene, object_sphere, vertices, faces, owners, margins = target
     (matrix, row, ray_space, planes, keep, (height, width)), (triangle_ids, barycentrics, depths_out) = eye, fragments
     layers = len(triangle_ids)
-    place, (xs, ys) = np.empty(TILE * TILE, np.int64), np.empty((2, TILE * TILE))
+    at, (xs, ys) = np.empty(TILE * TILE, np.int64), np.empty((2, TILE * TILE))
     across = (width + TILE - 1) // TILE
     state, depths = np.empty(HEADER), np.empty(layers)
     ids, sure = np.empty(layers, np.int32), np.empty(layers, np.bool_)
@@ -277,7 +277,7 @@ def cast(first, last, at, eye, points, fragments):
     state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
     state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
     for tile in range(first, last):
-        pixels = _pixels(tile, across, width, height, points, place, xs, ys)
+        pixels = _pixels(tile, across, width, height, points, at, xs, ys)
         for p in range(pixels):
             state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, xs[p], ys[p]
             x, y = xs[p] * 2 / width - 1, 1 - ys[p] * 2 / height
@@ -287,28 +287,25 @@ def cast(first, last, at, eye, points, fragments):
                 _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
             count = int(state[COUNT])
             for k in range(layers):
-                triangle_ids[k, place[p]] = ids[k] if k < count else -1
+                triangle_ids[k, at[p]] = ids[k] if k < count else -1
         # Corners are gathered by loops of their own, so short that the processor overlaps their waits for memory.
         count = 0
         for k in range(layers):
             for p in range(pixels):
-                if triangle_ids[k, place[p]] >= 0:
-                    t = triangle_ids[k, place[p]]
-                    near_faces[count, 0], near_faces[count, 1], near_faces[count, 2] = (
-                        faces[t, 0],
-                        faces[t, 1],
-                        faces[t, 2],
-                    )
+                if triangle_ids[k, at[p]] >= 0:
+                    t = triangle_ids[k, at[p]]
+                    for c in range(3):
+                        near_faces[count, c] = faces[t, c]
                     count += 1
         for n in range(count):
             for c in range(3):
-                v, m = near_faces[n, c], 3 * n + c
-                near_vertices[m, 0], near_vertices[m, 1] = vertices[v, 0], vertices[v, 1]
-                near_vertices[m, 2] = vertices[v, 2]
+                v = near_faces[n, c]
+                for r in range(3):
+                    near_vertices[3 * n + c, r] = vertices[v, r]
         n = 0
         for k in range(layers):
             for p in range(pixels):
-                to = place[p]
+                to = at[p]
                 if triangle_ids[k, to] < 0:
                     barycentrics[k, to, 0] = barycentrics[k, to, 1] = depths_out[k, to] = 0
                     continue

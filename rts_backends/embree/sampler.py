@@ -12,7 +12,7 @@ from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
 from rts_backends.embree.enlarged_triangles import Covers
 from rts_backends.embree.library import Scene
-from rts_backends.embree.loops import TILE, Cast, Eye, cast, keep_nearest_address
+from rts_backends.embree.loops import TILE, Eye, Target, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, pixel_matrix
 
 REFITS = 32
@@ -77,10 +77,10 @@ def _cast(
     flat = Fragments(ids, np.empty((shape[0], count, 2), np.float32), depth)
     scene, covers, (vertices, faces, *_) = prepared.scene, prepared.covers, prepared.proxy
     triangles = prepared.sphere, vertices, faces, covers.owners, covers.margins
-    at = Cast(scene.intersect, keep_nearest_address(), scene.handle, *triangles)
+    target = Target(scene.intersect, keep_nearest_address(), scene.handle, *triangles)
     space = np.concatenate([camera.projection, np.linalg.inv(camera.view)])
     lens = pixel_matrix(camera, size), -camera.view[2], space, _planes(camera.projection)
-    parallel(cast, tiles, at, Eye(*lens, camera.kept_sign(cull), size), points, flat)
+    parallel(cast, tiles, target, Eye(*lens, camera.kept_sign(cull), size), points, flat)
     return Fragments(ids.reshape(shape), flat.barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 
