@@ -92,7 +92,7 @@ def _drawn(
     chunks, bands = -(-blocks // PER_CHUNK), -(-height // BAND_ROWS)
     # Threads should not write to neighbouring memory.
     spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, 2 * bands), np.int64)
-    numbers = (np.float32(x) for x in (step, keep, camera.kept_sign("back")))
+    numbers = np.float32(step), np.float32(keep), np.float32(camera.kept_sign("back"))
     projected = Projected(faces, vertices, screen, matrix, size, *numbers)
     parallel(select, chunks, projected, (rows, spans, counts), work=10 * len(faces))
     triangles = sorted_list(keep, rows, spans, counts)
