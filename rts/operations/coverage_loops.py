@@ -182,7 +182,7 @@ SIDES = 24
 
 @compiled
 def _beside(number):
-    """Of a side, by its number: its axis, places across and along it, row and column of the cells before and behind."""
+    """The axis of a side, by its number; places across and along it; row and column of the cells before and behind."""
     axis, i, j = number // 12, number % 12 // 4, number % 4
     return (axis, i, j, j, i, j, i + 1) if axis == 0 else (axis, i, j, i, j, i + 1, j)
 

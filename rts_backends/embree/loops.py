@@ -294,8 +294,9 @@ def cast(first, last, target, eye, points, fragments):
             for p in range(pixels):
                 if triangle_ids[k, at[p]] >= 0:
                     t = triangle_ids[k, at[p]]
-                    for c in range(3):
-                        near_faces[count, c] = faces[t, c]
+                    near_faces[count, 0] = faces[t, 0]
+                    near_faces[count, 1] = faces[t, 1]
+                    near_faces[count, 2] = faces[t, 2]
                     count += 1
         for n in range(count):
             for c in range(3):

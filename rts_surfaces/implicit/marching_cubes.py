@@ -110,10 +110,12 @@ class Cases(NamedTuple):
     Attributes:
         counts: (256,) uint8, the number of triangles.
         edges: (256, 5, 3) int8, the edges that their corners lie on; −1 where there is no triangle.
+        ends: `EDGES`.
     """
 
     counts: np.ndarray
     edges: np.ndarray
+    ends: np.ndarray
 
 
 @functools.cache
@@ -123,7 +125,7 @@ def cases() -> Cases:
     for case, word in enumerate(CASES.split()):
         corners = [int(edge, 16) for edge in word.strip("-")]
         counts[case], edges[case, : len(corners)] = len(corners) // 3, corners
-    return Cases(counts, edges.reshape(256, 5, 3))
+    return Cases(counts, edges.reshape(256, 5, 3), EDGES)
 
 
 def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: float, closed: bool) -> Triangles:
@@ -168,7 +170,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
     from rts_surfaces.implicit import marching_cubes_loops as loops
     from rts_surfaces.implicit.distinct_loops import distinct
 
-    counts, _ = cases()
+    counts = cases().counts
     owners, corners, virtual, caps = _with_border(band, lattice, closed)
     inside = (band.values[corners] < 0) & ((virtual[:, None] >> np.arange(8) & 1) == 0)
     codes = (inside << np.arange(8)).sum(axis=1).astype(np.uint8)

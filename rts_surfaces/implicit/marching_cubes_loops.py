@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
-from rts_surfaces.implicit.marching_cubes import EDGES
 
 
 @compiled(inline="always")
@@ -197,7 +196,7 @@ def faces(start, stop, levels, mixed, cases, found):
     `Cases`.
     """
     shape, closed, out, owners, caps = levels.values.shape, levels.closed, found.faces, found.cells, found.caps
-    (offsets, cells, codes_of, first_of), (triangles_of, edges_of) = mixed, cases
+    (offsets, cells, codes_of, first_of), (triangles_of, edges_of, edges) = mixed, cases
     cells_z = first_of.shape[2]
     shift = 1 if closed else 0
     for x in range(start, stop):
@@ -217,7 +216,7 @@ def faces(start, stop, levels, mixed, cases, found):
             for i in range(triangles_of[code]):
                 for k in range(3):
                     edge = edges_of[code, i, k]
-                    corner, axis = EDGES[edge, 0], edge // 4
+                    corner, axis = edges[edge, 0], edge // 4
                     packed = first_of[x + (corner & 1), y + (corner >> 1 & 1), z + (corner >> 2 & 1)]
                     out[t, k] = packed // 8 + _bit_count(packed & 7 & ((1 << axis) - 1))
                 owners[t], caps[t] = number, cap
@@ -236,12 +235,12 @@ def edges_of_cells(corners, virtual, codes, cases, keys, pairs):
         keys: (3 T,) to be filled, T triangles: a number for each edge, the same in all cells that share the edge.
         pairs: (3 T, 2) to be filled: the rows of the edge's ends; twice the same row if one end is virtual.
     """
-    n, (triangles_of, edges_of) = 0, cases
+    n, (triangles_of, edges_of, edges) = 0, cases
     for c in range(len(codes)):
         for i in range(triangles_of[codes[c]]):
             for k in range(3):
                 edge = edges_of[codes[c], i, k]
-                a, b, axis = EDGES[edge, 0], EDGES[edge, 1], edge // 4
+                a, b, axis = edges[edge, 0], edges[edge, 1], edge // 4
                 row_a, row_b = corners[c, a], corners[c, b]
                 if virtual[c] >> a & 1:
                     keys[n], row_a = 9 * np.int64(row_b) + 3 + axis, row_b
