@@ -109,7 +109,7 @@ class SeenMesh(NamedTuple):
         """
         from rts.outlines import seen_mesh_loops
 
-        arguments = *map(read_only, hits), self, met, joined
+        arguments = read_only(hits.part), read_only(hits.triangle), self, met, joined
         parallel(seen_mesh_loops.seams, len(joined[0]), *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
