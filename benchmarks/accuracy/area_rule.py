@@ -182,7 +182,7 @@ def areas(outlines: Outlines, shown: np.ndarray, at_centres: np.ndarray, cell: t
     return dict(weights)
 
 
-def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> dict[tuple[int, int], np.ndarray]:
+def boundary_terms(outlines: Outlines, cell: tuple[int, int]) -> dict[tuple[int, int], np.ndarray]:
     """By how much a cell changes: for pairs of crossings, by the jump of colour at one, per motion (x, y) of the other.
 
     Jumps count from before a crossing to behind it, along its gap. From the crossing to the junction of its segment
@@ -191,7 +191,6 @@ def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> 
     Args:
         outlines: the outlines.
         cell: the cell (y, x).
-        border: width, in cells, of the strip along a border of two cells in which an edge belongs to both.
     """
     segments = outlines.segments
     found: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(2))
@@ -206,7 +205,7 @@ def boundary_terms(outlines: Outlines, cell: tuple[int, int], border: float) -> 
             signs = [1 if side < 2 else -1 for side in segments.dual_sides[s]]
             for e, endpoint in enumerate(endpoints):
                 for start, end, t, motion in _pieces(outlines, int(s), e, dual):
-                    sides = np.clip(((start + end) / 2 - 0.5) / border + 0.5, 0.0, 1.0)
+                    sides = (1 + np.sign((start + end) / 2 - 0.5)) / 2  # An edge along a border belongs to both cells.
                     share = np.prod(np.where(CORNERS[corner] == 1, sides, 1 - sides))
                     normal = share * np.array([end[1] - start[1], start[0] - end[0]])
                     jumps = {endpoint: signs[e] * (1 - t / 2 if alone else 1)}

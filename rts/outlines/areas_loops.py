@@ -10,9 +10,6 @@ import numpy as np
 from rts.compiling.loops import compiled
 from rts.outlines.segments_loops import on_sides
 
-BORDER = 1e-3
-"""Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
-
 
 @compiled(inline="always")
 def _point(place, x, y, along):
@@ -31,7 +28,7 @@ def _add_term(terms, s, k, i, share, rates, p, t, dx, dy):
 
 
 @compiled(inline="always")
-def _weigh_ray(terms, weight, length, s, i, n, side, border, ray, rates, other):
+def _weigh_ray(terms, weight, length, s, i, n, side, ray, rates, other):
     """Fill in what a crossing's outline, from its side of a dual cell to a point where others meet, adds to the cells.
 
     Returns the place of the crossing on the sides.
@@ -46,7 +43,6 @@ def _weigh_ray(terms, weight, length, s, i, n, side, border, ray, rates, other):
         i: the jump.
         n: the row of `weight`.
         side: the side.
-        border: width, in cells, beside borders of pixels in which both have a share.
         ray: the crossing, a point between, and where the outlines meet: x and y of each.
         rates: (2, 2, 4), weights of the motions, of the four crossings that pull, at both ends of both pieces.
         other: the sign of the segment's other jump, if the jump changes to the mean of both along the way; else 0.
@@ -59,8 +55,8 @@ def _weigh_ray(terms, weight, length, s, i, n, side, border, ray, rates, other):
     for p in range(1 if ray[1] == ray[2] else 2):
         (x, y), (wx, wy) = (ray[0], ray[1]) if p == 0 else (ray[1], ray[2])
         wx, wy = wx - x, wy - y
-        a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
-        b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+        a = min(max((0.5 - x) / wx, 0.0), 1.0) if wx != 0 else 0.0
+        b = min(max((0.5 - y) / wy, 0.0), 1.0) if wy != 0 else 0.0
         end = 0.0
         for m in range(3):
             begin, end = end, (min(a, b) if m == 0 else (max(a, b) if m == 1 else 1.0))
@@ -68,8 +64,8 @@ def _weigh_ray(terms, weight, length, s, i, n, side, border, ray, rates, other):
             if dx == 0 and dy == 0:
                 continue
             px, py = x + t * wx, y + t * wy
-            right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
-            below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+            # An edge along a border of two pixels belongs to both.
+            right, below = ((px >= 0.5) + (px > 0.5)) / 2, ((py >= 0.5) + (py > 0.5)) / 2
             for k in range(4):
                 east, south = k == 1 or k == 2, k >= 2
                 height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
@@ -150,8 +146,8 @@ def _behind(start, end, corner):
     """The area of a cell's quarter that a straight piece adds to that behind a ray; see `_weigh_ray`."""
     east, south, total = corner == 1 or corner == 2, corner >= 2, 0.0
     (x, y), (wx, wy) = start, (end[0] - start[0], end[1] - start[1])
-    a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
-    b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+    a = min(max((0.5 - x) / wx, 0.0), 1.0) if wx != 0 else 0.0
+    b = min(max((0.5 - y) / wy, 0.0), 1.0) if wy != 0 else 0.0
     low, high = min(a, b), max(a, b)
     for begin, stop in ((0.0, low), (low, high), (high, 1.0)):
         t = (begin + stop) / 2
@@ -282,7 +278,7 @@ def _add_areas(
         for p in range(2 * count):
             ray = order[(p + 1) // 2]  # Of each piece of the sides the rays at both ends.
             if region[p // 2] == r:
-                of_junction[junctions[ray], 0] += length[ray, corner] + 1e-9
+                of_junction[junctions[ray], 0] += length[ray, corner] + 1e-9  # Of no length, all count alike.
                 of_junction[junctions[ray], 1] += 1
                 total += length[ray, corner] + 1e-9
         for p in range(2 * count):
@@ -370,7 +366,7 @@ def add_dual_cells(begin, end, outlines, shown, at_centres, entries):
                     other = 1.0 if dual_sides[s, 1 - e] < 2 else -1.0
                 _fill_rates(rates, leader, s, e, t, own, share, pull)
                 ray = path[2 * e], path[1], (corner[leader, 0], corner[leader, 1])
-                at[count] = _weigh_ray(terms, weight, length, s - first, e, count, side, BORDER, ray, rates, other)
+                at[count] = _weigh_ray(terms, weight, length, s - first, e, count, side, ray, rates, other)
                 sides[count], crossings[count], junctions[count] = side, endpoints[s, e], leader - first
                 count += 1
         if count > 0:

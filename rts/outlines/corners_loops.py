@@ -5,23 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.edge_kinds import SEAM
 from rts.outlines.segments_loops import on_sides, row_of
-
-ON_FRONT = 1.0
-"""How much farther off its way, in cells, an outline counts to end at a segment on the side of what this bounds."""
-
-STRAIGHT = 1e-3
-"""Sine of an angle, in which an outline counts as straight: rounding of vertices must not tell where lines meet."""
-
-CLOSE = 1e-4
-"""Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
-
-TIE = 1e-4
-"""Difference of distances, in cells, that does not tell which of two outlines another one ends at: it is rounding."""
-
-REACH = 6
-"""The most rows from a segment to its junction."""
+from rts.outlines.tolerances import PARALLEL, TOUCH
 
 
 @compiled(inline="always")
@@ -34,12 +19,12 @@ def _minus(a, b):
 def _meeting(start, ahead, end, back):
     """Where lines from `start` along `ahead` and to `end` along `back` meet, and True if that is between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
-    if not abs(turn) > STRAIGHT * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
+    if not abs(turn) > PARALLEL * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
         return start, False
     t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
     meeting = start[0] + t * ahead[0], start[1] + t * ahead[1]
     there = (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1]
-    return meeting, t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
+    return meeting, t * np.hypot(ahead[0], ahead[1]) > TOUCH and there > TOUCH * np.hypot(back[0], back[1])
 
 
 @compiled(inline="always")
@@ -60,9 +45,9 @@ def _inward(tangent, side):
 
 @compiled(inline="always")
 def _within(point, origin, s):
-    """True if a point lies in a segment's dual cell, or `CLOSE` to it: vertices may lie on its sides, or corners."""
+    """True if a point lies in a segment's dual cell, or `TOUCH` off it: vertices may lie on its sides, or corners."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
-    return -CLOSE <= x <= 1 + CLOSE and -CLOSE <= y <= 1 + CLOSE
+    return -TOUCH <= x <= 1 + TOUCH and -TOUCH <= y <= 1 + TOUCH
 
 
 @loop
@@ -117,14 +102,15 @@ def corners(first, last, segments, neighbours, place, tangent, triangle):
                     beside += _angle(_minus(before, row_of(place, neighbours[s, 0])), ahead)
                 if neighbours[s, 3] >= 0:
                     beside += _angle(behind, _minus(row_of(place, neighbours[s, 3]), after))
-                alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
+                turn = _angle(ahead, behind)
+                alone = 1 - beside / turn if beside < turn else 0.0
             if alone > 0:
                 x, y = x + alone * (sharp[0] - x), y + alone * (sharp[1] - y)
                 on = np.hypot(x - start[0], y - start[1]) / np.hypot(ahead[0], ahead[1])
                 back = np.hypot(x - end[0], y - end[1]) / np.hypot(behind[0], behind[1])
-        chord = _minus(end, start)
+        chord, square = _minus(end, start), (end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2
         share = (x - start[0]) * chord[0] + (y - start[1]) * chord[1]
-        share = min(max(share / max(chord[0] * chord[0] + chord[1] * chord[1], 1e-12), 0.0), 1.0)
+        share = min(max(share / square, 0.0), 1.0) if square > 0 else 0.0
         # The corner of two straight lines moves as both of them say; a point of a curve as the ends of its chord do.
         lines = alone if on < 2 and back < 2 else 0.0
         pull[s, 0], pull[s, 3] = -lines * on / 2, -lines * back / 2
@@ -151,12 +137,6 @@ def _towards(start, way, a, b):
 
 
 @compiled(inline="always")
-def _between(at, start, end):
-    """True if a place on the sides of a dual cell comes after `start` and before `end`, clockwise."""
-    return start < at < end if start < end else at > start or at < end
-
-
-@compiled(inline="always")
 def _on_segment(origin, s, e, endpoints, place, corner):
     """The end e of a segment, and its corner, from the dual cell's first centre."""
     left, top = origin[s, 1] + 0.5, origin[s, 0] + 0.5
@@ -165,7 +145,7 @@ def _on_segment(origin, s, e, endpoints, place, corner):
 
 
 @compiled(inline="always")
-def _end_at(s, other, way, origin, endpoints, place, clock, corner, kind):
+def _end_at(s, other, way, origin, endpoints, place, corner):
     """Where the outline of the lone crossing of a segment would end at another one; see `join_lone_ends`.
 
     Returns:
@@ -176,11 +156,9 @@ def _end_at(s, other, way, origin, endpoints, place, clock, corner, kind):
     for e in range(2):
         end, middle = _on_segment(origin, other, e, endpoints, place, corner)
         t, off, ahead = _towards(start, way, end, middle)
-        if off < least - TIE or (off < least + TIE and ahead < nearest - TIE):
+        if off < least - TOUCH or (off < least + TOUCH and ahead < nearest - TOUCH):  # Rounding does not decide.
             best, least, nearest = t if e == 0 else 2 - t, off, ahead
-    # What the other segment bounds lies on the right of its way, and hides what is behind on its left. Seams hide none.
-    hidden = kind[endpoints[other, 0]] == SEAM or _between(clock[s, 0], clock[other, 0], clock[other, 1])
-    return best, least + (0.0 if hidden else ON_FRONT), nearest
+    return best, least, nearest
 
 
 @compiled(inline="always")
@@ -214,22 +192,22 @@ def _cut_at(s, other, origin, endpoints, place, corner):
 
 
 @compiled(inline="always")
-def _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner, kind):
+def _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner):
     """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
     step, on, least, nearest = 0, 0.0, np.inf, np.inf
-    for other in range(max(first, s - REACH), min(stop, s + REACH + 1)):
+    for other in range(first, stop):
         if endpoints[other, 1] < 0 or other == s:
             continue
         if endpoints[s, 1] < 0:
-            t, off, ahead = _end_at(s, other, way, origin, endpoints, place, clock, corner, kind)
-            nearer = off < least - TIE or (off < least + TIE and ahead < nearest - TIE)
+            t, off, ahead = _end_at(s, other, way, origin, endpoints, place, corner)
+            nearer = off < least - TOUCH or (off < least + TOUCH and ahead < nearest - TOUCH)
             if nearer and not _apart(first, stop, s, other, endpoints, clock):
                 step, on, least, nearest = other - s, t, off, ahead
             continue
         low, high = min(clock[other, 0], clock[other, 1]), max(clock[other, 0], clock[other, 1])
         crosses = (low < clock[s, 0] < high) != (low < clock[s, 1] < high)
         for e in range(2):  # Those that begin in one place do not.
-            crosses &= abs(clock[s, e] - low) > TIE and abs(clock[s, e] - high) > TIE
+            crosses &= abs(clock[s, e] - low) > TOUCH and abs(clock[s, e] - high) > TOUCH
         if crosses and other < s and step == 0 and junction[other] == 0:
             on = _cut_at(s, other, origin, endpoints, place, corner)
             step = other - s if on >= 0 else 0
@@ -249,10 +227,10 @@ def _where_both_end(s, other, origin, endpoints, dual_sides, place, tangent):
 
 
 @loop
-def join_lone_ends(segments, neighbours, place, tangent, kind):
+def join_lone_ends(segments, neighbours, place, tangent):
     """Fill in `junction` of segments, and change what else they have where there is one, `neighbours` (S, 4) included.
 
-    `kind` (B,) is that of `Crossings`; `place` (B, 2) and `tangent` (B, 2) are as of `corners`.
+    `place` (B, 2) and `tangent` (B, 2) are as of `corners`.
 
     A lone crossing ends at a segment of its dual cell, since what this bounds hides the rest. The outline goes on along
     its tangent to the first segment on its way. If it meets none, it goes to where it comes nearest to one. Lone
@@ -273,14 +251,14 @@ def join_lone_ends(segments, neighbours, place, tangent, kind):
             stop += 1
         for s in range(first, stop if stop > first + 1 else first):  # One alone in its dual cell meets none.
             way = _inward(row_of(tangent, endpoints[s, 0]), dual_sides[s, 0])
-            junction[s], on[s] = _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner, kind)
+            junction[s], on[s] = _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner)
         lead, alone = -1, True
         for s in range(first, stop):
             if endpoints[s, 1] >= 0 or junction[s] != 0:
                 continue
             if lead < 0:
                 lead = s
-            elif s - lead <= REACH and not _apart(first, stop, s, lead, endpoints, clock):
+            elif not _apart(first, stop, s, lead, endpoints, clock):
                 if alone:
                     corner[lead, 0], corner[lead, 1] = _where_both_end(
                         lead, s, origin, endpoints, dual_sides, place, tangent
@@ -294,9 +272,6 @@ def join_lone_ends(segments, neighbours, place, tangent, kind):
         if junction[other] != 0:  # What crosses another one is no junction: that one is.
             junction[s], on[s] = junction[s] + junction[other], on[other]
             other = s + junction[s]
-            if abs(junction[s]) > REACH:
-                junction[s] = 0
-                continue
         if endpoints[other, 1] < 0:
             corner[s, 0], corner[s, 1] = corner[other, 0], corner[other, 1]
             continue

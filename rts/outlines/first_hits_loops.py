@@ -9,33 +9,13 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT, SEAM
-from rts.outlines.spans_loops import TINY
-
-LAST = 4e-5
-"""Distance of last samples from crossings, in cells."""
-
-TOUCH = 1e-6
-"""Greatest distance along a gap, and greatest share of the depth, by which the ends of two spans differ where a surface
-goes on from one to the other."""
-
-MARGIN = 1e-7
-"""Share of the depth by which a span must be nearer than another to come before it."""
+from rts.outlines.tolerances import ALIKE, CREASE, TOUCH
 
 EMPTY = -9.0
 """The end of a span that covers nothing, before its start."""
 
 NOTHING, FIRST, SECOND = -1, -2, -3
 """In place of a span: nothing is seen; the sample at the first centre; that at the second."""
-
-ALIKE = 1e-5
-"""Share of the depth by which a sample at a centre may differ from a span of its surface."""
-
-SHORT = 2e-5
-"""Length of a piece of first hits that counts."""
-
-CREASE = np.cos(np.pi / 9)
-"""Cosine of the angle by which a surface turns at a seam; less if both triangles are large. Of many small triangles
-that hardly turn colours hardly change, and each is as expensive as an outline."""
 
 
 @compiled(inline="always")
@@ -75,16 +55,16 @@ def _next_start(spans, begin, stop, place):
 def _overtaken(spans, begin, stop, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
     best, by, i = spans[x, 1], -9, begin - 1
-    while i + 1 < stop and spans[i + 1, 0] <= best + TINY:
+    while i + 1 < stop and spans[i + 1, 0] <= best:
         i += 1
         low, high = max(place, spans[i, 0]), min(spans[x, 1], spans[i, 1])
-        if i == x or high - low <= TINY:
+        if i == x or high <= low:
             continue
         z = depth_at(spans, x, low)
         before, after = depth_at(spans, i, low) - z, depth_at(spans, i, high) - depth_at(spans, x, high)
-        if before < -MARGIN * abs(z):
+        if before < -ALIKE * abs(z):
             at = low
-        elif after < -MARGIN * abs(z):
+        elif after < -ALIKE * abs(z):
             # Linear in homogeneous coordinates, where depths are.
             wide = (spans[i, 4] + spans[i, 5] * low) * (spans[x, 4] + spans[x, 5] * low)
             far = (spans[i, 4] + spans[i, 5] * high) * (spans[x, 4] + spans[x, 5] * high)
@@ -92,7 +72,7 @@ def _overtaken(spans, begin, stop, x, place):
             at = low + (high - low) * before / (before - after)
         else:
             continue
-        if at < best - TINY or (by >= 0 and at <= best + TINY and depth_at(spans, i, at) < depth_at(spans, by, at)):
+        if at < best or (by >= 0 and at == best and depth_at(spans, i, at) < depth_at(spans, by, at)):
             best, by = at, i
     return best, by
 
@@ -129,7 +109,7 @@ def _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, st
         if x == NOTHING:
             place = _next_start(spans, begin, stop, place)
         elif x == FIRST:
-            beyond = TINY
+            beyond = 0.0
         else:
             place, by = _overtaken(spans, begin, stop, x, place)
         until = 1 - TOUCH if by < 0 else 1.0
@@ -246,7 +226,7 @@ def crossings(
         whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles
             of the last samples, of those that tell colours (before, behind), and 1 for the gap's first crossing, and
             for its last.
-        numbers: (2 N + 4 M, 5) float64 to fill: place of the crossing, the last samples, and those that tell colours.
+        numbers: (2 N + 4 M, 3) float64 to fill: place of the crossing, and of the samples that tell colours.
     """
     most = 4
     for g in range(first, last):
@@ -261,7 +241,7 @@ def crossings(
         rows[g], count, a = at, 0, 0
         for m in range(1, n):
             # A piece that is too short to count belongs to what comes after it.
-            if m + 1 < n and starts[m + 1] - starts[m] < SHORT:
+            if m + 1 < n and starts[m + 1] - starts[m] < TOUCH:
                 continue
             x, y, place, row = pieces[a], pieces[m], starts[m], at + count
             a = m
@@ -287,8 +267,6 @@ def crossings(
             whole[row, 0], whole[row, 1], whole[row, 2], whole[row, 3] = g, kind, before, behind
             whole[row, 4], whole[row, 5], whole[row, 8], whole[row, 9] = t, s, count == 0, 0
             numbers[row, 0] = place
-            numbers[row, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
-            numbers[row, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
             count += 1
         if count > 0:
             whole[at + count - 1, 9] = 1
@@ -308,7 +286,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, kind, trian
         whole: see `crossings`.
         numbers: see `crossings`.
         gap: (B, 3) int32 to fill.
-        points: (B, 5, 2) to fill: x and y of the crossing, of its last samples, and of those that tell colours.
+        points: (B, 3, 2) to fill: x and y of the crossing, and of the samples that tell colours.
         parts: (B, 2) int32 to fill.
         kind: (B,) int32 to fill.
         triangles: (B, 4) int32 to fill; −1 where nothing is seen.
@@ -321,7 +299,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, kind, trian
         joined[1 - row, y, x] &= counts[g] == 0
         for n in range(rows[g], rows[g] + counts[g]):
             gap[b, 0], gap[b, 1], gap[b, 2], kind[b] = y, x, row, whole[n, 1]
-            for i in range(5):
+            for i in range(3):
                 points[b, i, 0], points[b, i, 1] = x + 0.5 + numbers[n, i] * row, y + 0.5 + numbers[n, i] * (1 - row)
             for side in range(2):
                 parts[b, side], ends[b, side] = whole[n, 2 + side], whole[n, 8 + side] == 1
@@ -337,13 +315,13 @@ def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
         before = numbers[b - 1, 0] if b > at else 0.0
         after = numbers[b + 1, 0] if b + 1 < at + count else 1.0
         for side in range(2):
-            end = numbers[b, 1 + side]
+            end = numbers[b, 0]
             length = end - before if side == 0 else after - end
             inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
-            numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
+            numbers[b, 1 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
             found = _piece(pieces, starts, n, inward)
-            if found >= 0 and parts[found] == whole[b, 2 + side] and abs(inward - end) > TINY:
-                numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
+            if found >= 0 and parts[found] == whole[b, 2 + side] and inward != end:
+                numbers[b, 1 + side], whole[b, 6 + side] = inward, names[found, 1]
 
 
 @compiled(inline="always")

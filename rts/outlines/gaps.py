@@ -13,9 +13,6 @@ import numpy as np
 
 from rts.outlines import spans_loops
 
-INNER = 0.1
-"""Distance from a crossing, in cells, of the samples that tell colours; half the way to the next if that is less."""
-
 
 class Hits(NamedTuple):
     """The surfaces seen at M points of the image. Host arrays, (M,) for first hits, (K, M) for K layers, front to back.

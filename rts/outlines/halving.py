@@ -12,21 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
-from rts.outlines.gaps import INNER, Crossings, Hits, Stacks
-
-FINE = 1e-4
-"""Length of the interval, in cells, in which a crossing is known to lie."""
-
-BESIDE = 0.05
-"""Distance from an intersection, in cells, of the samples that tell how depths change."""
-
-ASIDE, ASIDE_HALVINGS = 0.02, 12
-"""Distance from a crossing, in cells, at which it is looked for once more, to tell the outline's direction, up to four
-times as far before or behind; and how often that interval is halved."""
-
-STEEP, RISE = 1.5, 0.1
-"""Two layers of a part may be two surfaces if their depths differ by more than so many times the least difference
-beside them, plus this share of a cell's width."""
+from rts.outlines.gaps import Crossings, Hits, Stacks
+from rts.outlines.tolerances import BESIDE, PARALLEL, RISE, TOUCH
 
 
 class Oracle(NamedTuple):
@@ -113,8 +100,8 @@ def find_crossings(layers: Hits, oracle: Oracle, hints: Hints | None = None) -> 
     joined[1 - gap[number, 2], gap[number, 0], gap[number, 1]] = False
     first, last = np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0
     inner = [
-        low - np.minimum(INNER, (low - np.where(first, 0.0, np.roll(high, 1))) / 2),
-        high + np.minimum(INNER, (np.where(last, 1.0, np.roll(low, -1)) - high) / 2),
+        low - np.minimum(BESIDE, (low - np.where(first, 0.0, np.roll(high, 1))) / 2),
+        high + np.minimum(BESIDE, (np.where(last, 1.0, np.roll(low, -1)) - high) / 2),
     ]
     points, beside = (np.stack([gaps.points(number, at) for at in two], 1) for two in ((low, high), inner))
     change = _Change.of(found, oracle)
@@ -180,7 +167,7 @@ def _intervals(
 
 
 def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Unit directions (B, 2) of outlines at crossings, by where these are `ASIDE`; 0 where they are unknown.
+    """Unit directions (B, 2) of outlines at crossings, by where these are `BESIDE`; 0 where they are unknown.
 
     Only where more than two are on the sides of a square of centres, and so it is not plain which belong together.
 
@@ -199,7 +186,7 @@ def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle
     direction = np.zeros((len(gap), 2))
     if not len(at):
         return direction
-    both, shift = found.at(np.tile(at, 2)), np.repeat([-ASIDE, ASIDE], len(at))
+    both, shift = found.at(np.tile(at, 2)), np.repeat([-BESIDE, BESIDE], len(at))
     step = gaps.step[both.gap]
     start = gaps.points(both.gap, (both.low + both.high) / 2) + shift[:, None] * step[:, ::-1]
 
@@ -207,9 +194,9 @@ def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle
         seen = oracle.layers(start + place[:, None] * step)
         return _unlike(seen, both.before) < _unlike(seen, both.behind)
 
-    low, high = np.full(len(shift), -4 * ASIDE), np.full(len(shift), 4 * ASIDE)
+    low, high = np.full(len(shift), -4 * BESIDE), np.full(len(shift), 4 * BESIDE)
     known = before(low) & ~before(high)
-    for _ in range(ASIDE_HALVINGS):
+    while (high - low).max() > TOUCH:
         middle = (low + high) / 2
         first = before(middle)
         low, high = np.where(first, middle, low), np.where(first, high, middle)
@@ -251,7 +238,7 @@ def _ends(gap: np.ndarray, layers: Hits) -> tuple[Hits, Hits, np.ndarray, np.nda
 
 
 def _smooth(layers: Hits, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Do depths from cells to the next ones along an axis change about as beside? (M,) bool; see `STEEP`."""
+    """Do depths from cells to the next ones along an axis change about as beside? (M,) bool; see `RISE`."""
     depth = np.where(layers.part >= 0, layers.depth, np.nan)
     steps = [np.abs(np.diff(depth, axis=1, append=np.nan)), np.abs(np.diff(depth, axis=2, append=np.nan))]
     change = np.where(axis == 1, steps[1][:, y, x], steps[0][:, y, x])
@@ -259,7 +246,7 @@ def _smooth(layers: Hits, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np
     after = np.where(axis == 1, steps[1][:, y, np.minimum(x + 1, w - 1)], steps[0][:, np.minimum(y + 1, h - 1), x])
     before = np.where(axis == 1, steps[1][:, y, np.maximum(x - 1, 0)], steps[0][:, np.maximum(y - 1, 0), x])
     beside = np.nan_to_num(np.fmin(before, after))
-    steep = change > STEEP * beside + RISE * oracle.widths(layers.depth[:, y, x])
+    steep = change > beside + RISE * oracle.widths(layers.depth[:, y, x])
     return np.logical_not(steep.any(0))
 
 
@@ -270,13 +257,13 @@ def _level(a: Hits, b: Hits, oracle: Oracle) -> np.ndarray:
 
 
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals halved until they are `FINE`; those in which surfaces go on, and halves with level ends, are dropped.
+    """Intervals halved until they are `TOUCH`; those in which surfaces go on, and halves with level ends, are dropped.
 
     A scene is sampled for two halvings at once: fewer calls cost less than the samples that prove to be of no use.
     """
     finished = []
     while True:
-        fine = found.high - found.low <= FINE
+        fine = found.high - found.low <= TOUCH
         # Hints may be as close to one another, where nothing changes.
         finished.append(found.at(np.flatnonzero(fine & ~_level(found.before, found.behind, oracle).all(0))))
         found = found.at(np.flatnonzero(~fine))
@@ -296,12 +283,12 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
 
 
 def _goes_on(steps: Sequence[Hits], oracle: Oracle) -> np.ndarray:
-    """(M,) True where the layers at places that follow one another change about evenly; see `STEEP`."""
+    """(M,) True where the layers at places that follow one another change about evenly; see `RISE`."""
     part, depth = (np.stack([x[i] for x in steps]) for i in (0, 2))
     change = np.abs(np.diff(depth, axis=0))
     none = np.full_like(change[:1], np.inf)
     beside = np.minimum(np.concatenate([none, change[:-1]]), np.concatenate([change[1:], none]))
-    even = change <= STEEP * beside + RISE * oracle.widths(depth[:1])
+    even = change <= beside + RISE * oracle.widths(depth[:1])
     return (part == part[:1]).all((0, 1)) & even.all((0, 1))
 
 
@@ -382,12 +369,12 @@ class _Change(NamedTuple):
         """`kind` (B,) and `slope` (B, 2, 2) of crossings."""
         kind, slope = self.kind.copy(), np.zeros((len(self.kind), 2, 2))
         a, b = (side.of_layer(self.first) for side in self.sides)
-        level = np.abs(b.depth - a.depth) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth))
+        level = np.abs(b.depth - a.depth) <= PARALLEL * oracle.widths(np.maximum(a.depth, b.depth))
         meets = np.flatnonzero((a.part >= 0) & (b.part >= 0) & (a.part != b.part) & level)
         if len(meets):
             slopes = _sampled_slopes(found.at(meets), self.first[meets], gaps, oracle)
             turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
-            there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
+            there = turn > PARALLEL * oracle.widths(a.depth[meets])  # False for NaN.
             kind[meets[there]], slope[meets[there]] = INTERSECT, slopes[there]
         return kind, slope
 

@@ -106,7 +106,8 @@ class SeenMesh(NamedTuple):
 
         `hits` (H, W), read-only, are seen at centres; for `met` see `mark_silhouettes`.
         """
-        parallel(seen_mesh_loops.seams, len(joined[0]), *hits, self, met, joined, work=8 * joined[0].size)
+        arguments = hits.part, hits.triangle, self, met, joined
+        parallel(seen_mesh_loops.seams, len(joined[0]), *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""

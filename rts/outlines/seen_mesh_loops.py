@@ -137,7 +137,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, mesh, met, joined):
+def seams(first, last, part, triangle, mesh, met, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose first hits are joined by a patch of triangles.
 
     Args:
@@ -145,13 +145,11 @@ def seams(first, last, part, triangle, depth, mesh, met, joined):
         last: the line after the last.
         part: (H, W) int32, the parts seen at centres; or (K H, W), those of layers.
         triangle: likewise, their triangles.
-        depth: likewise, float64.
         mesh: the triangles of some parts, a `SeenMesh`.
         met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.mark_silhouettes`.
         joined: (2, H, W) or (2, K H, W) bool to fill: along x, and along y.
     """
-    (_, height, width), corners, keep = met.shape, np.empty((3, 4)), mesh.keep
-    seen, rows, vertices, faces, adjacent = mesh.seen, mesh.rows, mesh.vertices, mesh.faces, mesh.adjacent
+    (_, height, width), keep, seen, faces, adjacent = met.shape, mesh.keep, mesh.seen, mesh.faces, mesh.adjacent
     part_range = mesh.first, mesh.first + len(mesh.starts) - 1
     apart = np.empty(width, np.bool_)
     for y in range(first, last):
@@ -176,11 +174,6 @@ def seams(first, last, part, triangle, depth, mesh, met, joined):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
                     end = _walked(t, s, start, axis, at, seen, faces, adjacent)
                 joined[axis, y, x] = end == s
-                if end >= 0 and end != s and _touch(faces, end, s):
-                    # Rounding may tell neighbours apart; patches that pass through one another share no corner.
-                    sign, there = corners_of(end, rows, vertices, faces, corners), depth[y + dy, x + dx]
-                    z = plane_at(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
-                    joined[axis, y, x] = abs(z - there) <= 1e-5 * abs(there)
 
 
 @loop

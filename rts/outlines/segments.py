@@ -63,6 +63,6 @@ def joined(crossings: Crossings, layered: bool = False) -> Segments:
     numbers = np.zeros(count, np.int32), adjacent, np.empty((count, 2)), np.empty((count, 4))
     segments = Segments(origin, endpoints, dual_sides, *numbers)
     parallel(corners_loops.corners, count, segments, neighbours, *known, triangle, work=150 * count)
-    corners_loops.join_lone_ends(segments, neighbours, *known, crossings.kind)
+    corners_loops.join_lone_ends(segments, neighbours, *known)
     adjacent[:] = neighbours[:, 1:3]
     return segments

@@ -6,25 +6,7 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT, SEAM
-
-LONE, ON_ONE_SIDE, OTHER_BEHIND, OTHER_KIND, OTHER_DEPTH = 2.0, 1.5, 0.5, 1.0, 1.0
-"""Costs, in cells, beside the length of segments: a crossing that stays alone; a segment between two on one side,
-which may be the two edges of something thin; one between crossings with different parts behind them; one between an
-outline and a line where surfaces intersect; one between surfaces that end far from one another along the ray, of which
-half counts for those `FAR` cells apart."""
-
-FAR = 4.0
-"""Cells along a ray, each as deep as it is wide; see `OTHER_DEPTH`."""
-
-ASIDE = 0.4
-"""Share of a cost that is by how far a segment leads off the direction of an outline at its end; the rest is by its
-length."""
-
-ALIKE = 1e-6
-"""Distance, in cells, of two crossings that are in one place."""
-
-MOST_ALIKE = 4
-"""The most crossings in one place: a centre is the end of so many gaps."""
+from rts.outlines.tolerances import FAR, LONE, TOUCH, UNLIKE
 
 
 @compiled(inline="always")
@@ -70,7 +52,7 @@ def ends_of(gap, place, kind, parts, height, width):
         b = 2 * len(gap) - 1 - n if backwards else n
         y, x, row = gap[b, 0], gap[b, 1], gap[b, 2]
         at = place[b, 0] - x - 0.5 if row == 1 else place[b, 1] - y - 0.5
-        at = min(max(at, 0.0), 1 - 1e-9)
+        at = min(max(at, 0.0), 1 - TOUCH)  # Before what starts at the next side.
         front, back = parts[b, 0], parts[b, 1]
         if kind[b] == BEHIND_ENDS or (kind[b] == INTERSECT and front > back):
             front, back = back, front
@@ -194,24 +176,26 @@ def _join(begins, ends, place, tangent, cells_away, partner):
 
 @compiled(inline="always")
 def _cost(a, b, ends, place, tangent, cells_away):
-    """The cost of a segment between two ends; infinite if they cannot be joined."""
+    """The cost of a segment between two ends, in cells; infinite if they cannot be joined.
+
+    It is how far the segment leads off the outline's direction at both ends, and `UNLIKE` if these are on one side, or
+    if their surfaces lie far apart.
+    """
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
     other_front, other_back = ends[b, 3], ends[b, 4]
     # A line of intersection goes on as the outline of either surface, or where either intersects a third one.
     if front != other_front and ends[a, 2] == 0 and (back == other_front or (back == other_back and not crosses)):
-        front, back = back, front
+        front = back
     if front != other_front and ends[b, 2] == 0 and front == other_back:
-        other_front, other_back = other_back, other_front
+        other_front = other_back
     p, q = ends[a, 0], ends[b, 0]
-    dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], 0.0
+    dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], UNLIKE * (ends[a, 1] == ends[b, 1])
     for e in range(2):
         tx, ty = row_of(tangent, p if e == 0 else q)
-        aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
-        cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
-    cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
+        cost += abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy) / 2
     apart = abs(cells_away[p] - cells_away[q])
-    cost += OTHER_DEPTH * apart / (apart + FAR) if apart > 0 else 0.0  # Unknown ones are NaN.
-    return np.inf if front != other_front or ends[a, 2] * ends[b, 2] > 0 else cost + OTHER_KIND * crosses
+    cost += UNLIKE * apart / (apart + FAR) if apart > 0 else 0.0  # Unknown ones are NaN.
+    return np.inf if front != other_front or ends[a, 2] * ends[b, 2] > 0 else cost
 
 
 @compiled(inline="always")
@@ -312,7 +296,7 @@ def _neighbours(endpoints, place):
         for e in range(2):
             endpoint = 2 * s + e
             far = 0
-            for _ in range(2 * MOST_ALIKE):
+            for _ in range(8):  # A centre is the end of four gaps.
                 b = endpoints[endpoint // 2, endpoint % 2]
                 if b < 0 or far == 2:
                     break
@@ -321,7 +305,7 @@ def _neighbours(endpoints, place):
                     break
                 endpoint = next_ + 1 - 2 * (next_ % 2)  # Its other end.
                 c = endpoints[endpoint // 2, endpoint % 2]
-                if c < 0 or abs(place[c, 0] - place[b, 0]) + abs(place[c, 1] - place[b, 1]) > ALIKE:
+                if c < 0 or abs(place[c, 0] - place[b, 0]) + abs(place[c, 1] - place[b, 1]) > TOUCH:
                     found[s, (1 - far) if e == 0 else 2 + far] = c
                     far += 1
     return found

@@ -7,10 +7,8 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
 from rts.outlines.seen_mesh_loops import on_edges, plane_at
+from rts.outlines.tolerances import PARALLEL, TOUCH
 from rts.sampling.points_loops import corners_of, edge
-
-SLACK = 0.01
-"""By how much edges are wider than these, against rounding, in cells."""
 
 ANY_SIZE = 6
 """The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
@@ -95,7 +93,7 @@ def _passes_centres(a, b, seen):
     found = np.isnan(seen[a, 0]) or np.isnan(seen[b, 0])
     for axis in range(2):
         low, high = min(seen[a, axis], seen[b, axis]), max(seen[a, axis], seen[b, axis])
-        found |= np.ceil(low - 0.5 - SLACK) <= np.floor(high - 0.5 + SLACK)
+        found |= np.ceil(low - 0.5 - TOUCH) <= np.floor(high - 0.5 + TOUCH)
     return found
 
 
@@ -146,13 +144,13 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
     x, y = ends[k, axis], ends[k, 1 - axis]
     dx, dy = ends[1 - k, axis] - x, ends[1 - k, 1 - axis] - y
-    low, high = np.ceil(max(y - 0.5 - SLACK, 0.0)), np.floor(min(y + dy - 0.5 + SLACK, lines - 1.0))
+    low, high = np.ceil(max(y - 0.5 - TOUCH, 0.0)), np.floor(min(y + dy - 0.5 + TOUCH, lines - 1.0))
     for n in range(int(min(low, lines * 1.0)), int(max(high, -1.0)) + 1):
         start, stop = x, x + dx
         if dy > 0:
-            start = x + dx * min(max((n + 0.5 - SLACK - y) / dy, 0.0), 1.0)
-            stop = x + dx * min(max((n + 0.5 + SLACK - y) / dy, 0.0), 1.0)
-        begin, end = min(start, stop) - 0.5 - SLACK, max(start, stop) - 0.5 + SLACK
+            start = x + dx * min(max((n + 0.5 - TOUCH - y) / dy, 0.0), 1.0)
+            stop = x + dx * min(max((n + 0.5 + TOUCH - y) / dy, 0.0), 1.0)
+        begin, end = min(start, stop) - 0.5 - TOUCH, max(start, stop) - 0.5 + TOUCH
         for m in range(int(max(np.floor(begin), 0.0)), int(min(end, count - 2.0)) + 1):
             y0, x0 = (n, m) if axis == 0 else (m, n)
             y1, x1 = (n, m + 1) if axis == 0 else (m + 1, n)
@@ -226,7 +224,7 @@ def finish_directions(width, depth, kind, slope, tangent, away):
         away[b] = np.log(width[0] + width[1] * depth[b]) / width[1] if width[1] > 0 else depth[b] / width[0]
         if kind[b] == INTERSECT:
             x, y = slope[b, 1, 0] - slope[b, 0, 0], slope[b, 1, 1] - slope[b, 0, 1]
-            if abs(x) + abs(y) > 1e-4 * (width[0] + width[1] * depth[b]):
+            if abs(x) + abs(y) > PARALLEL * (width[0] + width[1] * depth[b]):
                 tangent[b, 0], tangent[b, 1] = y, -x
             else:
                 kind[b] = BEFORE_ENDS

@@ -10,19 +10,11 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.outlines.silhouettes_loops import ANY_SIZE
+from rts.outlines.tolerances import LARGE, TOUCH
 from rts.sampling.points_loops import corners_of, edge
-
-TINY = 1e-9
-"""Shortest length of a span."""
 
 REACHES = 0, 1, 2, 4
 """How many cells before gaps there are marks for triangles; see `around`."""
-
-LARGE = 16.0
-"""Area in the image, in cells, from which on triangles are large."""
-
-SLACK = np.float32(0.01)
-"""By how much boxes of triangles are larger than these, against rounding, in cells."""
 
 
 @loop
@@ -106,8 +98,8 @@ def _box(a, b, c, seen, height, width, box):
     area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
     for axis in range(2):
         low, high = min(seen[a, axis], seen[b, axis], seen[c, axis]), max(seen[a, axis], seen[b, axis], seen[c, axis])
-        box[2 * axis] = 0.0 if np.isnan(area) else low - SLACK
-        box[2 * axis + 1] = (width if axis == 0 else height) if np.isnan(area) else high + SLACK
+        box[2 * axis] = 0.0 if np.isnan(area) else low - np.float32(TOUCH)
+        box[2 * axis + 1] = (width if axis == 0 else height) if np.isnan(area) else high + np.float32(TOUCH)
     return area
 
 
@@ -234,10 +226,10 @@ def _add(t, on_line, bounds, normal, gap, line, corners, names, spans, count):
     are where on the line the triangle is seen, from and to, and the last number of its `names`; `normal` is its own.
     """
     (first, last, column), (least, most, kind) = on_line, bounds
-    for g in range(first, last if most - least > TINY else first):
+    for g in range(first, last if most - least > 1e-9 else first):  # Along an edge it is rounding.
         start, end = least - 0.5 - gap[g, column], most - 0.5 - gap[g, column]
         # Those that touch it count, since a layer may end at a centre.
-        if min(end, 1.0) - max(start, 0.0) >= -TINY:
+        if start <= 1 and end >= 0:
             names[count, 0], names[count, 1], names[count, 2] = g, t, kind
             _fill(spans, count, start, end, line, corners, gap[g, column] + 0.5)
             if spans.shape[1] > 6:

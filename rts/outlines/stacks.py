@@ -13,9 +13,10 @@ import numpy as np
 from rts.compiling.threads import parallel, read_only
 from rts.outlines import spans_loops
 from rts.outlines import stacks_loops as loops
-from rts.outlines.gaps import INNER, Crossings, Gaps, Hits, Stacks
+from rts.outlines.gaps import Crossings, Gaps, Hits, Stacks
 from rts.outlines.seen_mesh import SeenMesh
 from rts.outlines.spans import moving_edges, spans_on
+from rts.outlines.tolerances import BESIDE
 
 ROOM = 2
 """Changes for each span, for which there is room at first: it starts and ends. More are found where many intersect."""
@@ -89,7 +90,7 @@ def _changes(
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         found = np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
         known = gap, begins, spans, names, parts, opaque, *layers[::2], room, rows, counts
-        parallel(loops.changes, count, *known, INNER, *found, work=600 * count)
+        parallel(loops.changes, count, *known, BESIDE, *found, work=600 * count)
         if not (rows < 0).any():
             break
         room = np.append(0, np.cumsum(counts))  # Many surfaces pass through one another.

@@ -15,14 +15,8 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
-from rts.outlines.first_hits_loops import ALIKE, LAST, MARGIN, SHORT, TOUCH, depth_at, is_seam
-from rts.outlines.spans_loops import TINY
-
-CLOSE = 1e-5
-"""Distance from a centre, in cells, within which the sample there decides on which side of it a run ends."""
-
-SAME = 1e-4
-"""Share of the depth by which a sample at a centre may differ from the run that it lies on."""
+from rts.outlines.first_hits_loops import depth_at, is_seam
+from rts.outlines.tolerances import ALIKE, TOUCH
 
 LOW, HIGH = 9, 10
 """Columns of `own`: where a run starts, in the row of its first span, and where it ends, in that of its last."""
@@ -61,7 +55,7 @@ def _listed(part, z, seen, depth, y, x):
         if seen[layer, y, x] < 0:
             found = 0
             break
-        if seen[layer, y, x] == part and abs(depth[layer, y, x] - z) <= SAME * abs(z):
+        if seen[layer, y, x] == part and abs(depth[layer, y, x] - z) <= ALIKE * abs(z):
             found = 1
             break
     return found
@@ -86,26 +80,26 @@ def _fit_to_centres(head, tail, own, of, opaque, seen, depth, gap, g):
     for k in range(2):
         centre, y, x = float(k), gap[g, 0] + k * (1 - gap[g, 2]), gap[g, 1] + k * gap[g, 2]
         start, end = own[head, LOW], own[tail, HIGH]
-        if not real or start > centre + CLOSE or end < centre - CLOSE:
+        if not real or start > centre + TOUCH or end < centre - TOUCH:
             continue
         i = head
         while own[i, HIGH] < centre and of[i, AFTER] >= 0:
             i = of[i, AFTER]
         z = depth_at(own, i, centre)
         found = _listed(of[head, PART], z, seen, depth, y, x)
-        if start < centre - CLOSE and end > centre + CLOSE:
+        if start < centre - TOUCH and end > centre + TOUCH:
             real = found != 0 or _hides(opaque, z, seen, depth, y, x)
             continue
-        if abs(start - centre) <= CLOSE:
+        if abs(start - centre) <= TOUCH:
             if k == 0:
-                own[head, LOW] = -1.0 if found != 0 else max(start, TINY)
+                own[head, LOW] = -1.0 if found != 0 else max(start, TOUCH)
             else:
-                own[head, LOW] = min(start, 1 - TINY) if found != 0 else 2.0
-        if abs(end - centre) <= CLOSE:
+                own[head, LOW] = min(start, 1 - TOUCH) if found != 0 else 2.0
+        if abs(end - centre) <= TOUCH:
             if k == 0:
-                own[tail, HIGH] = max(end, TINY) if found != 0 else -1.0
+                own[tail, HIGH] = max(end, TOUCH) if found != 0 else -1.0
             else:
-                own[tail, HIGH] = 2.0 if found != 0 else min(end, 1 - TINY)
+                own[tail, HIGH] = 2.0 if found != 0 else min(end, 1 - TOUCH)
     return real
 
 
@@ -183,7 +177,7 @@ def _next_meeting(stack, count, own, place, until):
     for m in range(count - 1):
         i, j = stack[m], stack[m + 1]
         beyond = depth_at(own, j, until)
-        if beyond < z - MARGIN * abs(z):
+        if beyond < z - ALIKE * abs(z):
             there = _meeting(own, i, j, place, until)
             if there < best:
                 best, at = there, m
@@ -290,21 +284,19 @@ def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, sample
             continue
         x = i
         if kind == BEFORE_ENDS:
-            end = min(max(place - LAST, own[x, 0], 0.0), place)
             beside = place_of[e - 1] if f > 0 else 0.0
-            inward = end - min(inner, max(end - beside, 0.0) / 2)
+            inward = place - min(inner, max(place - beside, 0.0) / 2)
             while own[i, 0] > inward and of[i, BEFORE] >= 0:
                 i = of[i, BEFORE]
-            inward = max(inward, min(own[i, 0], end))
+            inward = max(inward, min(own[i, 0], place))
         else:
-            end = max(min(place + LAST, own[x, 1], 1.0), place)
             beside = place_of[e + 1] if f + 1 < found else 1.0
-            inward = end + min(inner, max(beside - end, 0.0) / 2)
+            inward = place + min(inner, max(beside - place, 0.0) / 2)
             while own[i, 1] < inward and of[i, AFTER] >= 0:
                 i = of[i, AFTER]
-            inward = min(inward, max(own[i, 1], end))
+            inward = min(inward, max(own[i, 1], place))
         if n == 0:
-            samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = of[x, PART], of[x, TRIANGLE], end
+            samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = of[x, PART], of[x, TRIANGLE], place
         for k in range(2, samples.shape[1]):
             if samples[e, k, 0] == of[x, PART] and samples[e, k, 1] == of[x, TRIANGLE]:
                 samples[e, k, 1], places[e, k] = of[i, TRIANGLE], inward
@@ -321,7 +313,7 @@ def _fill_runs(g, n, own, of, opaque, seen, depth, gap, knots):
         tail, j = i, i
         while of[tail, AFTER] >= 0:
             tail = of[tail, AFTER]
-        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _fit_to_centres(i, tail, own, of, opaque, seen, depth, gap, g)
+        real = own[tail, HIGH] - own[i, LOW] >= TOUCH and _fit_to_centres(i, tail, own, of, opaque, seen, depth, gap, g)
         while j >= 0:
             of[j, LIVE] = real
             j = of[j, AFTER]

@@ -70,9 +70,7 @@ class Entries(NamedTuple):
 def _normals(outlines):
     """Unit normals (B, 2) of outlines at crossings: the mean of their segments'; along the gap for a lone crossing."""
     gap, place, endpoints = outlines.gap, outlines.place, outlines.segments.endpoints
-    normal = np.empty((len(gap), 2))
-    for b in range(len(gap)):
-        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
+    normal = np.zeros((len(gap), 2))
     for s in range(len(endpoints)):
         if endpoints[s, 1] < 0 or endpoints[s, 0] == endpoints[s, 1]:
             continue
@@ -86,8 +84,8 @@ def _normals(outlines):
             normal[b, 1] += sign * ny
     for b in range(len(gap)):
         length = np.hypot(normal[b, 0], normal[b, 1])
-        normal[b, 0] /= length
-        normal[b, 1] /= length
+        normal[b, 0] = normal[b, 0] / length if length > 0 else gap[b, 2]
+        normal[b, 1] = normal[b, 1] / length if length > 0 else 1 - gap[b, 2]
     return normal
 
 
@@ -155,7 +153,7 @@ def _add_sides(begin, end, outlines, beside, shown, row, at_centres, entries, co
                 if share > 0 and former >= 0 and color != former:
                     colors[n, 0], colors[n, 1], colors[n, 2], parts[n] = at, former, color, share
                     n += 1
-            mine = inside / (length if length > 1e-6 else 1.0)
+            mine = 0.5 / max(length, 0.5)
             across = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
             shares = (cell, mine), (next_, 1 - mine)
             if stack.shape[2] == 0:

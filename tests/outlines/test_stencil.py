@@ -12,7 +12,6 @@ from soups import soup_of
 import rts
 from benchmarks.accuracy import area_rule
 from rts.outlines import stacks, stencil_loops
-from rts.outlines.areas_loops import BORDER
 from rts.outlines.found import FIELDS
 from rts.splatting.layers import composites
 from rts.splatting.stencil import splat
@@ -96,9 +95,8 @@ def test_boundary_terms_are_those_of_rays(number):
     checked = 0
     for cell in np.unique(stencil.motion_cell):
         expected, known = 0.0, True
-        for (endpoint, mover), terms in area_rule.boundary_terms(
-            outlines, divmod(int(cell), at_centres.shape[1]), BORDER
-        ).items():
+        place = divmod(int(cell), at_centres.shape[1])
+        for (endpoint, mover), terms in area_rule.boundary_terms(outlines, place).items():
             known &= not intersect[mover] and ending[mover] >= 0
             before, behind = of[rows[endpoint, 0]], of[rows[endpoint, 1]]
             expected += float(terms @ moves[ending[mover]]) * (before - behind)

@@ -22,10 +22,10 @@ pytestmark = pytest.mark.core
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rts", "rts_backends", "rts_surfaces", "rts_cli", "rts_diagnostics", "rts_testing")
 
-CALLS = {"silhouette": 593, "lambert": 800}
+CALLS = {"silhouette": 582, "lambert": 789}
 """The most Python calls of the library's own functions in a step of 48 x 48 pixels: a pose, an image, its gradient."""
 
-LINES = 36_063
+LINES = 36_038
 """The most lines of code of these packages, without blank lines, comments and docstrings."""
 
 LINES_OF_A_RENDER = 12_000
