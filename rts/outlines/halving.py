@@ -15,6 +15,9 @@ from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
 from rts.outlines.gaps import Crossings, Hits, Stacks
 from rts.outlines.tolerances import BESIDE, PARALLEL, RISE, TOUCH
 
+FINE = 5 * TOUCH
+"""Length, in cells, to which gaps are halved. Rays end as near to a surface as that; each halving is a sample more."""
+
 
 class Oracle(NamedTuple):
     """A scene that can be sampled at any point.
@@ -196,7 +199,7 @@ def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle
 
     low, high = np.full(len(shift), -4 * BESIDE), np.full(len(shift), 4 * BESIDE)
     known = before(low) & ~before(high)
-    while (high - low).max() > TOUCH:
+    while (high - low).max() > FINE:
         middle = (low + high) / 2
         first = before(middle)
         low, high = np.where(first, middle, low), np.where(first, high, middle)
@@ -257,13 +260,13 @@ def _level(a: Hits, b: Hits, oracle: Oracle) -> np.ndarray:
 
 
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals halved until they are `TOUCH`; those in which surfaces go on, and halves with level ends, are dropped.
+    """Intervals halved until they are `FINE`; those in which surfaces go on, and halves with level ends, are dropped.
 
     A scene is sampled for two halvings at once: fewer calls cost less than the samples that prove to be of no use.
     """
     finished = []
     while True:
-        fine = found.high - found.low <= TOUCH
+        fine = found.high - found.low <= FINE
         # Hints may be as close to one another, where nothing changes.
         finished.append(found.at(np.flatnonzero(fine & ~_level(found.before, found.behind, oracle).all(0))))
         found = found.at(np.flatnonzero(~fine))
