@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT, SEAM
-from rts.outlines.tolerances import FAR, LONE, TOUCH, UNLIKE
+from rts.outlines.tolerances import ASIDE, FAR, LONE, ON_ONE_SIDE, OTHER_BEHIND, TOUCH, UNLIKE
 
 
 @compiled(inline="always")
@@ -178,24 +178,26 @@ def _join(begins, ends, place, tangent, cells_away, partner):
 def _cost(a, b, ends, place, tangent, cells_away):
     """The cost of a segment between two ends, in cells; infinite if they cannot be joined.
 
-    It is how far the segment leads off the outline's direction at both ends, and `UNLIKE` if these are on one side, or
-    if their surfaces lie far apart.
+    It is how far the segment leads off the outline's direction at both ends, and its length; more if it joins what is
+    unlike.
     """
     front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
     other_front, other_back = ends[b, 3], ends[b, 4]
     # A line of intersection goes on as the outline of either surface, or where either intersects a third one.
     if front != other_front and ends[a, 2] == 0 and (back == other_front or (back == other_back and not crosses)):
-        front = back
+        front, back = back, front
     if front != other_front and ends[b, 2] == 0 and front == other_back:
-        other_front = other_back
+        other_front, other_back = other_back, other_front
     p, q = ends[a, 0], ends[b, 0]
-    dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], UNLIKE * (ends[a, 1] == ends[b, 1])
+    dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], 0.0
     for e in range(2):
         tx, ty = row_of(tangent, p if e == 0 else q)
-        cost += abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy) / 2
+        aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
+        cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
+    cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
     apart = abs(cells_away[p] - cells_away[q])
     cost += UNLIKE * apart / (apart + FAR) if apart > 0 else 0.0  # Unknown ones are NaN.
-    return np.inf if front != other_front or ends[a, 2] * ends[b, 2] > 0 else cost
+    return np.inf if front != other_front or ends[a, 2] * ends[b, 2] > 0 else cost + UNLIKE * crosses
 
 
 @compiled(inline="always")

@@ -49,15 +49,30 @@ LONE = 2.0
 """Cost of a crossing that stays alone, in cells: an outline ends at another rather than turn by so much.
 
 Where it is larger, outlines that something else hides are joined to those of other things; where it is smaller, those
-that turn in a dual cell fall apart. Two ends that are alone in a dual cell are joined
-at any cost, since none is as high.
+that turn in a dual cell fall apart.
+"""
+
+ASIDE = 0.4
+"""Share of a segment's cost, at each end, that is by how far it leads off the direction of the outline there; up to a
+half, the rest is by its length. Where it is larger, outlines go straight on to far ends; smaller, to near ones.
+"""
+
+ON_ONE_SIDE = 1.5
+"""Cost, in cells, of a segment between two crossings on one side of a dual cell.
+
+They may be the two edges of something thin: where the number is larger, it goes on where it ends; where it is smaller,
+hair and fences fall to pieces.
+"""
+
+OTHER_BEHIND = 0.5
+"""Cost, in cells, of a segment between crossings with different parts behind them.
+
+Where it is larger, outlines end where something behind them does; where it is smaller, they go on along other things.
 """
 
 UNLIKE = 1.0
-"""Cost of a segment between two crossings on one side of a dual cell, and of one between surfaces far from one another
-along the ray, in cells by which outlines lead aside.
-
-Where it is larger, things thinner than a cell go on where they end; where it is smaller, they end where they go on.
+"""Cost, in cells, of a segment between surfaces far from one another along the ray, or between an outline and a line
+where surfaces intersect. Where it is larger, surfaces that slope are torn; smaller, outlines go on as those of others.
 """
 
 FAR = 4.0

@@ -26,7 +26,8 @@ RED, GREEN = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
 AROUND = pytest.mark.parametrize("share", [0.7, 1.4])
 """Shares of a number."""
 TOUCH, ALIKE, BESIDE, PARALLEL, RISE = 2e-5, 1e-5, 0.1, 1e-3, 0.2
-LONE, UNLIKE, FAR, LARGE, CREASE = 2.0, 1.0, 4.0, 16.0, np.radians(20)
+LARGE, CREASE = 16.0, np.radians(20)
+LONE, ASIDE, ON_ONE_SIDE, OTHER_BEHIND, UNLIKE, FAR = 2.0, 0.4, 1.5, 0.5, 1.0, 4.0
 
 
 def card(left, right, color, height=lambda x, y: 0.0 * x, half=10.0):
@@ -97,7 +98,7 @@ def test_rise_is_the_step_in_depth_that_surfaces_without_triangles_may_have(shar
     np.testing.assert_allclose(crossings.place[:, 0], 2.2, atol=TOUCH)
 
 
-def joined(ends, directions=None, depths=None):
+def joined(ends, directions=None, depths=None, behind=None):
     """The pairs of crossings that are joined in the dual cell between centres at (1.5, 1.5) and (2.5, 2.5).
 
     Args:
@@ -105,12 +106,14 @@ def joined(ends, directions=None, depths=None):
             1 if the way clockwise leaves the surface there, −1 if it enters it.
         directions: angles of outlines to the right; None for unknown ones.
         depths: `Crossings.cells_away`.
+        behind: the parts behind; None for none.
     """
     side, at, sign = (np.array(x) for x in zip(*ends, strict=True))
     gap = np.array([[(1, 1, 1), (1, 2, 0), (2, 1, 1), (1, 1, 0)][s] for s in side], np.int32)
     place = gap[:, 1::-1] + 0.5 + at[:, None] * np.column_stack([gap[:, 2], 1 - gap[:, 2]])
     kind = np.where((sign > 0) == (side < 2), 0, 1).astype(np.int32)
-    parts = np.where(kind[:, None] == [0, 1], 0, -1).astype(np.int32)
+    parts = np.where(kind[:, None] == [0, 1], 0, np.full((len(ends), 1), -1) if behind is None else np.c_[behind])
+    parts = parts.astype(np.int32)
     dual, along, rows = segments_loops.ends_of(gap, place, kind, parts, 5, 5)
     order = np.lexsort((along, dual))
     angle = np.array(directions if directions is not None else [0.0] * len(ends))
@@ -121,34 +124,70 @@ def joined(ends, directions=None, depths=None):
     return {tuple(sorted(pair)) for pair in endpoints[inside].tolist()}
 
 
+def along(off, length):
+    """What `off` and `length` cost, of which each end of a segment has its own; two lists of both."""
+    return sum(ASIDE * x for x in off) + 2 * (0.5 - ASIDE) * length
+
+
 @AROUND
 def test_lone_is_the_cost_of_an_end(share):
     """An outline along a diagonal, and an end on each side that it meets: pairs on a side, or those two alone."""
-    cost = share * LONE
-    width = (cost - UNLIKE) / (1 + 0.5**0.5) if share < 1 else 0.9
-    apart = cost - UNLIKE - width * (1 + 0.5**0.5)
+    cost, each = share * LONE + along([0, 0], 2**0.5) / 2 - ON_ONE_SIDE, along([0.5**0.5, 1], 1)
+    width = cost / each if share < 1 else 0.9
+    apart = cost - width * each
     away = FAR * apart / (UNLIKE - apart)
     ends = [(0, 0.0, 1), (0, width, -1), (2, 1.0, -1), (2, 1 - width, 1)]
     found = joined(ends, [np.pi / 4, np.pi / 2, np.pi / 4, np.pi / 2], [0.0, away, 0.0, away])
     assert found == ({(0, 1), (2, 3)} if share < 1 else {(0, 2)})
 
 
-@AROUND
-def test_unlike_is_how_far_outlines_lead_aside_before_they_are_those_of_two_tips(share):
+@pytest.mark.parametrize("share", [0.7, 1.25])
+def test_on_one_side_is_how_far_outlines_lead_aside_before_they_are_those_of_two_tips(share):
     """Something thin enters at the top, and something at the bottom: one thing that goes through, or two that end."""
-    angle = np.pi / 2 - np.arcsin(share * UNLIKE / 2)
+    cost = share * ON_ONE_SIDE - along([0, 0], 1)
+    off = min(cost / (2 * ASIDE), 1.0)
+    apart = cost - along([off, off], 0)
+    away = FAR * apart / (UNLIKE - apart)
     ends = [(0, 0.5, 1), (0, 0.50001, -1), (2, 0.50001, 1), (2, 0.5, -1)]
-    found = joined(ends, [angle] * 4)
+    found = joined(ends, [np.pi / 2 - np.arcsin(off)] * 4, [0.0, 0.0, away, away])
     assert found == ({(0, 3), (1, 2)} if share < 1 else {(0, 1), (2, 3)})
+
+
+def aside(cost):
+    """How far aside of a straight way across a dual cell a segment ends that costs so much more."""
+    found = np.linspace(0, 1, 10001)
+    return found[np.searchsorted(along([found, found], np.hypot(1, found)) - along([0, 0], 1), cost)]
+
+
+@AROUND
+def test_other_behind_is_what_an_outline_costs_that_goes_on_before_another_part(share):
+    ends = [(0, 0.1, 1), (2, 0.1 + aside(share * OTHER_BEHIND), -1), (2, 0.1, -1)]
+    assert joined(ends, [np.pi / 2] * 3, behind=[1, 1, 2]) == ({(0, 1)} if share < 1 else {(0, 2)})
+
+
+def test_unlike_is_what_an_outline_costs_that_goes_on_far_away():
+    """It goes on aside for 0.7 of it, straight on rather than come back by the side that it came in at for 1.3."""
+    down, far = [np.pi / 2] * 3, 1e6
+    ends = [(0, 0.1, 1), (2, 0.1 + aside(0.7 * UNLIKE), -1), (2, 0.1, -1)]
+    assert joined(ends, down, [0.0, 0.0, far]) == {(0, 1)}
+    assert ON_ONE_SIDE - along([0, 0], 1) == pytest.approx(1.3 * UNLIKE)
+    assert joined([(0, 0.5, 1), (0, 0.50001, -1), (2, 0.5, -1)], down, [0.0, 0.0, far]) == {(0, 2)}
 
 
 @AROUND
 def test_far_is_the_distance_in_depth_that_counts_half(share):
     """An outline goes on straight to a surface that ends farther off, or aside to one at its own depth."""
-    angle = np.pi / 2
-    ends = [(0, 0.25, 1), (2, 0.5, -1), (2, 0.25, -1)]
-    found = joined(ends, [angle] * 3, [0.0, 0.0, share * FAR])
+    ends = [(0, 0.1, 1), (2, 0.1 + aside(UNLIKE / 2), -1), (2, 0.1, -1)]
+    found = joined(ends, [np.pi / 2] * 3, [0.0, 0.0, share * FAR])
     assert found == ({(0, 2)} if share < 1 else {(0, 1)})
+
+
+@pytest.mark.parametrize("share", [0.7, 1.1])
+def test_aside_is_the_share_of_direction_beside_length(share):
+    """An outline goes straight across, or a shorter way, at right angles, to the side beside: for this share either."""
+    short = along([0, 0], 1) + 2 * ASIDE * (1 - share)
+    ends = [(0, 1 - short, 1), (1, 0.0, -1), (2, 1 - short, -1)]
+    assert joined(ends, [np.pi / 2] * 3) == ({(0, 2)} if share < 1 else {(0, 1)})
 
 
 def seam(height, turn=0.0):
