@@ -52,7 +52,7 @@ def forward(samples: np.ndarray, points: np.ndarray, *rest: np.ndarray, opaque: 
     Returns (N,) bool, true where the derivative may not be zero.
     """
     *arrays, out = rest
-    picture, kept = Picture(samples, *arrays, opaque), np.empty(len(points), np.bool_)
+    picture, kept = Picture(samples, *arrays, opaque=opaque), np.empty(len(points), np.bool_)
     picture.check(points)
     parallel(_forward, len(points), picture, points, out, kept, work=WORK * len(points))
     return kept
@@ -67,7 +67,7 @@ def push(samples: np.ndarray, points: np.ndarray, *rest: Any, opaque: bool, kept
     kept = np.ones(len(points), np.bool_) if kept is None else kept
     t_samples = np.zeros_like(samples) if t_samples is None else t_samples
     t_points = np.zeros_like(points) if t_points is None else t_points
-    arguments = Picture(samples, *arrays, opaque), points, t_samples, t_points, kept, out
+    arguments = Picture(samples, *arrays, opaque=opaque), points, t_samples, t_points, kept, out
     parallel(_push, len(points), *arguments, work=WORK * len(points) // 4)
 
 
@@ -80,7 +80,7 @@ def pull(samples: np.ndarray, points: np.ndarray, *rest: Any, opaque: bool, kept
     kept = np.ones(len(points), np.bool_) if kept is None else kept
     g_samples = np.zeros_like(samples) if g_samples is None else g_samples
     g_points = np.zeros_like(points) if g_points is None else g_points
-    _pull(Picture(samples, *arrays, opaque), points, g, g_samples, g_points, kept)
+    _pull(Picture(samples, *arrays, opaque=opaque), points, g, g_samples, g_points, kept)
 
 
 @compiled

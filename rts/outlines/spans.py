@@ -16,7 +16,7 @@ from rts.compiling.threads import parallel
 from rts.outlines import first_hits_loops, silhouettes_loops, spans_loops
 from rts.outlines.gaps import Crossings, Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
-from rts.outlines.tolerances import BESIDE
+from rts.outlines.tolerances import BESIDE, TOUCH
 
 
 def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.ndarray, seams: bool) -> Crossings:
@@ -49,7 +49,9 @@ def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.nda
     gap, points, kind = np.empty((count, 3), np.int32), np.empty((count, 3, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
     first_hits_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, kind, triangles, ends, same)
-    place, last, inner = points[:, 0].copy(), points[:, [0, 0]], points[:, 1:]
+    place, inner = points[:, 0].copy(), points[:, 1:]
+    # On their side of the edge, beyond rounding, since normals and motions may jump there.
+    last = place[:, None] + 2 * TOUCH * np.array([[-1], [1]]) * np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)[:, None]
     slope, tangent, away = moving_edges(kind, beside, triangles, place, meshes, width)
     return Crossings(gap, place, kind, slope, ends, last, inner, beside, same, triangles, tangent, away)
 

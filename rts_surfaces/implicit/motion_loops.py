@@ -70,7 +70,7 @@ def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: Sp
     Before it are params, rows and numbers. The corners lie where values reach `isovalue` on edges of the `lattice`.
     """
     *operands, out = rest
-    edges = Edges(values, *operands, values.dtype.type(isovalue), lattice)
+    edges = Edges(values, *operands, isovalue=values.dtype.type(isovalue), lattice=lattice)
     parallel(_cross, len(out), edges, out, work=60 * len(out))
 
 
@@ -80,7 +80,7 @@ def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattic
     Before it are params, rows, numbers, and the tangents (M,) of the values.
     """
     *operands, moved, out = rest
-    edges = Edges(values, *operands, values.dtype.type(isovalue), lattice)
+    edges = Edges(values, *operands, isovalue=values.dtype.type(isovalue), lattice=lattice)
     parallel(_push_crossings, len(out), edges, moved, out, work=60 * len(out))
 
 
@@ -90,7 +90,7 @@ def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattic
     Before it are params, rows, numbers, and the gradient (N, 3) of the positions of `crossing`.
     """
     *operands, g, result = rest
-    _pull_crossings(Edges(values, *operands, values.dtype.type(isovalue), lattice), g, result)
+    _pull_crossings(Edges(values, *operands, isovalue=values.dtype.type(isovalue), lattice=lattice), g, result)
 
 
 @loop
