@@ -35,7 +35,7 @@ def edge(corners, k, sign):
 
 
 @loop
-def hits(points, begins, order, rows, clip, keep, vertices, faces, found):
+def hits(points, begins, order, rows, clip, keep, vertices, faces, ids, weights, depths):
     """The K nearest triangles at points of the image, by depth, then by index.
 
     Args:
@@ -47,10 +47,11 @@ def hits(points, begins, order, rows, clip, keep, vertices, faces, found):
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        found: `Fragments`: ids (K, M) int32, filled with −1; barycentrics (K, M, 2) float32, to fill; depths (K, M)
-            float64, filled with infinity.
+        ids: (K, M) int32, filled with −1.
+        weights: (K, M, 2) float32 to fill with the first two barycentrics.
+        depths: (K, M) float64, filled with infinity.
     """
-    (ids, weights, depths), height, corners, box = found, len(begins) - 1, np.empty((3, 4)), np.empty(4)
+    height, corners, box = len(begins) - 1, np.empty((3, 4)), np.empty(4)
     for t in range(len(faces)):
         sign = corners_of(t, rows, vertices, faces, corners)
         if sign == 0 or sign * keep < 0:
