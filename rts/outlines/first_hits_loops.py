@@ -226,7 +226,7 @@ def crossings(
         whole: (2 N + 4 M, 10) int32 to fill: gap, kind (see `_kind`, or SEAM), parts before and behind, then triangles
             of the last samples, of those that tell colours (before, behind), and 1 for the gap's first crossing, and
             for its last.
-        numbers: (2 N + 4 M, 3) float64 to fill: place of the crossing, and of the samples that tell colours.
+        numbers: (2 N + 4 M, 5) float64 to fill: place of the crossing, the last samples, and those that tell colours.
     """
     most = 4
     for g in range(first, last):
@@ -267,6 +267,9 @@ def crossings(
             whole[row, 0], whole[row, 1], whole[row, 2], whole[row, 3] = g, kind, before, behind
             whole[row, 4], whole[row, 5], whole[row, 8], whole[row, 9] = t, s, count == 0, 0
             numbers[row, 0] = place
+            # On their side of the edge, beyond rounding, since normals and motions may jump there.
+            numbers[row, 1] = min(max(place - 2 * TOUCH, spans[x, 0], 0.0), place) if x >= 0 else place
+            numbers[row, 2] = max(min(place + 2 * TOUCH, spans[y, 1], 1.0), place) if y >= 0 else place
             count += 1
         if count > 0:
             whole[at + count - 1, 9] = 1
@@ -286,7 +289,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, kind, trian
         whole: see `crossings`.
         numbers: see `crossings`.
         gap: (B, 3) int32 to fill.
-        points: (B, 3, 2) to fill: x and y of the crossing, and of the samples that tell colours.
+        points: (B, 5, 2) to fill: x and y of the crossing, of its last samples, and of those that tell colours.
         parts: (B, 2) int32 to fill.
         kind: (B,) int32 to fill.
         triangles: (B, 4) int32 to fill; −1 where nothing is seen.
@@ -299,7 +302,7 @@ def listed(rows, counts, gap_of, whole, numbers, gap, points, parts, kind, trian
         joined[1 - row, y, x] &= counts[g] == 0
         for n in range(rows[g], rows[g] + counts[g]):
             gap[b, 0], gap[b, 1], gap[b, 2], kind[b] = y, x, row, whole[n, 1]
-            for i in range(3):
+            for i in range(5):
                 points[b, i, 0], points[b, i, 1] = x + 0.5 + numbers[n, i] * row, y + 0.5 + numbers[n, i] * (1 - row)
             for side in range(2):
                 parts[b, side], ends[b, side] = whole[n, 2 + side], whole[n, 8 + side] == 1
@@ -315,13 +318,13 @@ def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
         before = numbers[b - 1, 0] if b > at else 0.0
         after = numbers[b + 1, 0] if b + 1 < at + count else 1.0
         for side in range(2):
-            end = numbers[b, 0]
+            end = numbers[b, 1 + side]
             length = end - before if side == 0 else after - end
             inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
-            numbers[b, 1 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
+            numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
             found = _piece(pieces, starts, n, inward)
             if found >= 0 and parts[found] == whole[b, 2 + side] and inward != end:
-                numbers[b, 1 + side], whole[b, 6 + side] = inward, names[found, 1]
+                numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
 
 
 @compiled(inline="always")

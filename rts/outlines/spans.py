@@ -16,7 +16,7 @@ from rts.compiling.threads import parallel
 from rts.outlines import first_hits_loops, silhouettes_loops, spans_loops
 from rts.outlines.gaps import Crossings, Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
-from rts.outlines.tolerances import BESIDE, TOUCH
+from rts.outlines.tolerances import BESIDE
 
 
 def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.ndarray, seams: bool) -> Crossings:
@@ -41,17 +41,15 @@ def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.nda
     begins, names, spans, parts = spans_on(gaps, meshes, seams)
     count = len(gaps.gap)
     room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
-    whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 3))
+    whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
     seen = *hits, np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     known = gaps.gap, begins, spans, names, parts, *seen, BESIDE, rows, counts, whole, numbers
     parallel(first_hits_loops.crossings, count, *known, work=600 * count)
     count = counts.sum()
-    gap, points, kind = np.empty((count, 3), np.int32), np.empty((count, 3, 2)), np.empty(count, np.int32)
+    gap, points, kind = np.empty((count, 3), np.int32), np.empty((count, 5, 2)), np.empty(count, np.int32)
     beside, triangles, ends = np.empty((count, 2), np.int32), np.empty((count, 4), np.int32), np.empty((count, 2), bool)
     first_hits_loops.listed(rows, counts, gaps.gap, whole, numbers, gap, points, beside, kind, triangles, ends, same)
-    place, inner = points[:, 0].copy(), points[:, 1:]
-    # On their side of the edge, beyond rounding, since normals and motions may jump there.
-    last = place[:, None] + 2 * TOUCH * np.array([[-1], [1]]) * np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)[:, None]
+    place, last, inner = points[:, 0].copy(), points[:, 1:3], points[:, 3:]
     slope, tangent, away = moving_edges(kind, beside, triangles, place, meshes, width)
     return Crossings(gap, place, kind, slope, ends, last, inner, beside, same, triangles, tangent, away)
 
