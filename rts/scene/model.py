@@ -104,15 +104,8 @@ class Model:
     camera_names: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        counts = {
-            "part": self.parts,
-            "node": self.nodes,
-            "skin": self.skins,
-            "clip": self.clips,
-            "camera": self.cameras,
-        }
-        words = [f"{len(x)} {name}{'s' * (len(x) > 1)}" for name, x in counts.items() if x]
-        return f"Model({', '.join(words)})"
+        kinds = zip(("part", "node", "skin", "clip"), (self.parts, self.nodes, self.skins, self.clips), strict=True)
+        return f"Model({', '.join(f'{len(x)} {kind}' + 's' * (len(x) > 1) for kind, x in kinds if x)})"
 
     def clip(self, clip: str | int) -> Clip:
         """The clip of a name, or of an index.
