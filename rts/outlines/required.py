@@ -1,4 +1,4 @@
-"""What samples beside crossings have to tell, by the shaders of scenes and the derivatives in their values."""
+"""The tasks of samples beside crossings, set by the shaders of scenes and by derivatives in their values."""
 
 from __future__ import annotations
 
