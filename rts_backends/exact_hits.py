@@ -5,10 +5,37 @@ A hit for which no such triangle is found nearby is dropped.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
+
+
+class SeenTriangles(NamedTuple):
+    """Triangles as a camera sees them, and those around each corner.
+
+    Attributes:
+        matrix: (4, 4), see `pixel_matrix`.
+        row: (4,), see `depth_of`.
+        keep: see `Camera.kept_sign`.
+        vertices: (V, 3) float32.
+        faces: (T, 3) int32.
+        around: (T, 3) int32, the result of `places`.
+        offsets: (V + 1,) int32, of `corner_lists` of `around`.
+        members: (3 T,) int32, also.
+    """
+
+    matrix: np.ndarray
+    row: np.ndarray
+    keep: float
+    vertices: np.ndarray
+    faces: np.ndarray
+    around: np.ndarray
+    offsets: np.ndarray
+    members: np.ndarray
+
 
 WALK = 16
 """The most steps from triangle to triangle, in search of one that covers the pixel's centre."""
@@ -98,14 +125,14 @@ def holds(triangles, count, t):
 
 
 @compiled
-def _walk(t, x, y, hits, count, scene, around, offsets, members):
+def _walk(t, x, y, hits, count, seen, corners):
     """Go from triangle `t` to its neighbours, towards one that covers a pixel and is not among the first `count` hits.
 
     Neighbours share a corner. If `t` itself covers the pixel, it is the last triangle, even if it is among the hits.
-    Returns True if the last triangle covers the pixel, this triangle, its depth and its first two barycentrics. `scene`
-    are the arguments of `look` from `matrix` on; for the arrays after it see `correct`.
+    Returns True if the last triangle covers the pixel, this triangle, its depth and its first two barycentrics.
     """
-    inside, least, z, a, b = look(t, x, y, *scene)
+    matrix, row, keep, vertices, faces, around, offsets, members = seen
+    inside, least, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)
     for _ in range(WALK):
         if inside:
             break
@@ -115,7 +142,7 @@ def _walk(t, x, y, hits, count, scene, around, offsets, members):
             v = around[t, c]
             for at in range(offsets[v], offsets[v + 1]):
                 s = members[at]
-                inside_s, least_s, z_s, a_s, b_s = look(s, x, y, *scene)
+                inside_s, least_s, z_s, a_s, b_s = look(s, x, y, matrix, row, keep, vertices, faces, corners)
                 # Triangles among the hits have hits of their own; so coplanar layers all stay.
                 if holds(hits, count, s):
                     inside_s, least_s = False, -np.inf
@@ -129,17 +156,15 @@ def _walk(t, x, y, hits, count, scene, around, offsets, members):
 
 
 @loop
-def correct(
-    first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
-):  # fmt: skip
+def correct(first, last, seen, fragments):
     """Correct the hits of pixel rows [first, last): fill barycentrics and depths, correct ids, drop those that miss.
 
-    `triangle_ids` (K, H, W) are changed in place; each pixel's hits are sorted by depth, then by index, and empty
-    layers follow. Hits behind an empty layer are dropped. `around` is the result of `places`, `offsets` and `members`
-    are its `corner_lists`; for `matrix`, `row` and `keep` see `look`.
+    The ids of `fragments` (K, H, W) are changed in place; each pixel's hits are sorted by depth, then by index, and
+    empty layers follow. Hits behind an empty layer are dropped.
     """
+    triangle_ids, barycentrics, depths = fragments
     layers, _, width = triangle_ids.shape
-    scene = matrix, row, keep, vertices, faces, np.empty((3, 4))
+    corners = np.empty((3, 4))
     hits, hit_depths, hit_params = np.empty(layers, np.int32), np.empty(layers), np.empty((layers, 2))
     for j in range(first, last):
         for i in range(width):
@@ -148,7 +173,7 @@ def correct(
                 t = triangle_ids[k, j, i]
                 if t < 0:
                     break
-                inside, t, z, a, b = _walk(t, i + 0.5, j + 0.5, hits, count, scene, around, offsets, members)
+                inside, t, z, a, b = _walk(t, i + 0.5, j + 0.5, hits, count, seen, corners)
                 if not inside or holds(hits, count, t):
                     continue
                 at = count

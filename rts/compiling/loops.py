@@ -10,11 +10,8 @@ made; whole arrays with indices, numbers, and tuples of numbers are not. A helpe
 of the loop: a tenth of the time of loops over outlines. Large ones take longer to compile. It counts none either, but
 where it writes to an array in a branch alone, returns early, leaves a loop by `break`, or takes an item of a tuple by a
 number known only at run time, as a loop over a tuple does. To choose one of two arrays (`a if x else b`), or to pass
-arguments on as `*tuple`, is counted; to choose between their items is not.
-
-Records (named tuples) of arrays are taken apart by attribute. Their arrays should have one dtype, layout and
-writability in all calls: any other makes numba compile anew, and numba 0.60 has taken one for the other, with a
-TypeError.
+arguments on as `*tuple`, is counted; to choose between their items is not. Arrays that a helper takes from a record, by
+attribute, count as its arguments do. Whether one is None is known to the compiler of arguments alone, not of fields.
 """
 
 from __future__ import annotations

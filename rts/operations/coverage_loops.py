@@ -6,6 +6,7 @@ Around each point 4 × 4 cells are looked at. `look` fills tables of them; the l
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,72 +19,68 @@ WORK = 400
 """Nanoseconds for a point, roughly."""
 
 
-def forward(
-    samples: np.ndarray,
-    points: np.ndarray,
-    row: np.ndarray,
-    planes: np.ndarray,
-    lens: np.ndarray,
-    out: np.ndarray,
-    *,
-    opaque: bool,
-) -> np.ndarray:
-    """Fill `out` (N, 1) with the covered shares. Returns (N,) bool, true where the derivative may not be zero."""
-    _check(samples, points, row, planes, lens)
-    kept = np.empty(len(points), np.bool_)
-    known = samples, points, row, planes, lens, opaque
-    parallel(_forward, len(points), *known, out, kept, work=WORK * len(points))
+class Picture(NamedTuple):
+    """What covers points; see `coverage`, whose arguments these are.
+
+    Attributes:
+        samples: (M, 3).
+        row: (H, W) int32.
+        planes: (9, H, W).
+        lens: (5,).
+        opaque: whether samples let no light through.
+    """
+
+    samples: np.ndarray
+    row: np.ndarray
+    planes: np.ndarray
+    lens: np.ndarray
+    opaque: bool
+
+    def check(self, points: np.ndarray) -> None:
+        """Refuse arrays of other shapes."""
+        samples, row, planes, lens, _ = self
+        channels, height, width = planes.shape
+        fits = row.shape == (height, width) and samples.shape[1] == 3 and points.shape[1] == 3 and len(samples) > 0
+        if not fits or channels != 9 or min(height, width) <= 2 * REACH or len(lens) != 5 or row.max() >= len(samples):
+            shapes = ", ".join(str(x.shape) for x in (samples, points, row, planes, lens))
+            raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
+
+
+def forward(samples: np.ndarray, points: np.ndarray, *rest: np.ndarray, opaque: bool) -> np.ndarray:
+    """Fill the last of `rest`, out (N, 1), with the covered shares; the others are the picture's arrays.
+
+    Returns (N,) bool, true where the derivative may not be zero.
+    """
+    *arrays, out = rest
+    picture, kept = Picture(samples, *arrays, opaque=opaque), np.empty(len(points), np.bool_)
+    picture.check(points)
+    parallel(_forward, len(points), picture, points, out, kept, work=WORK * len(points))
     return kept
 
 
-def push(
-    samples: np.ndarray,
-    points: np.ndarray,
-    row: np.ndarray,
-    planes: np.ndarray,
-    lens: np.ndarray,
-    t_samples: np.ndarray | None,
-    t_points: np.ndarray | None,
-    out: np.ndarray,
-    *,
-    opaque: bool,
-    kept: np.ndarray | None,
-) -> None:
-    """Fill `out` (N, 1) with the derivative along `t_samples` and `t_points`, each None if zero."""
+def push(samples: np.ndarray, points: np.ndarray, *rest: Any, opaque: bool, kept: np.ndarray | None) -> None:
+    """Fill the last of `rest`, out (N, 1), with the derivative.
+
+    Before it are the picture's arrays, and the tangents of samples and of points, each None if zero.
+    """
+    *arrays, t_samples, t_points, out = rest
     kept = np.ones(len(points), np.bool_) if kept is None else kept
     t_samples = np.zeros_like(samples) if t_samples is None else t_samples
     t_points = np.zeros_like(points) if t_points is None else t_points
-    known, work = (samples, points, row, planes, lens, opaque), WORK * len(points) // 4
-    parallel(_push, len(points), *known, t_samples, t_points, kept, out, work=work)
+    arguments = Picture(samples, *arrays, opaque=opaque), points, t_samples, t_points, kept, out
+    parallel(_push, len(points), *arguments, work=WORK * len(points) // 4)
 
 
-def pull(
-    samples: np.ndarray,
-    points: np.ndarray,
-    row: np.ndarray,
-    planes: np.ndarray,
-    lens: np.ndarray,
-    g: np.ndarray,
-    g_samples: np.ndarray | None,
-    g_points: np.ndarray | None,
-    *,
-    opaque: bool,
-    kept: np.ndarray | None,
-) -> None:
-    """Add to `g_samples` and `g_points` the gradients, from `g` (N, 1) of the result, each unless None."""
+def pull(samples: np.ndarray, points: np.ndarray, *rest: Any, opaque: bool, kept: np.ndarray | None) -> None:
+    """Add to the last two of `rest` the gradients of samples and of points, each unless None.
+
+    Before them are the picture's arrays, and the gradient (N, 1) of the result.
+    """
+    *arrays, g, g_samples, g_points = rest
     kept = np.ones(len(points), np.bool_) if kept is None else kept
     g_samples = np.zeros_like(samples) if g_samples is None else g_samples
     g_points = np.zeros_like(points) if g_points is None else g_points
-    _pull(samples, points, row, planes, lens, opaque, g, g_samples, g_points, kept)
-
-
-def _check(samples: np.ndarray, points: np.ndarray, row: np.ndarray, planes: np.ndarray, lens: np.ndarray) -> None:
-    """Refuse arrays of other shapes."""
-    channels, height, width = planes.shape
-    fits = row.shape == (height, width) and samples.shape[1] == 3 and points.shape[1] == 3 and len(samples) > 0
-    if not fits or channels != 9 or min(height, width) <= 2 * REACH or len(lens) != 5 or row.max() >= len(samples):
-        shapes = ", ".join(str(x.shape) for x in (samples, points, row, planes, lens))
-        raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
+    _pull(Picture(samples, *arrays, opaque=opaque), points, g, g_samples, g_points, kept)
 
 
 @compiled
@@ -136,8 +133,9 @@ def _some_front(x, y, depth, planes):
 
 
 @compiled
-def _look(samples, x, y, depth, row, planes, opaque, covers, depths, fronts):
+def _look(samples, at, row, planes, opaque, covers, depths, fronts):
     """Fill tables (4, 4) of the cells around a point; True if some cell is in front of it."""
+    x, y, depth = at
     height, width = planes.shape[1:]
     top, left = _corner(y, height), _corner(x, width)
     closest, own_a, own_b, own_steep, some = OWN, 0.0, 0.0, 0.0, False
@@ -183,19 +181,29 @@ SIDES = 24
 
 
 @compiled
-def _side(covers, depths, row, planes, x, y, number):
-    """A side between two of the cells around a point, by its number.
+def _beside(number):
+    """The axis of a side, by its number; places across and along it; row and column of the cells before and behind."""
+    axis, i, j = number // 12, number % 12 // 4, number % 4
+    return (axis, i, j, j, i, j, i + 1) if axis == 0 else (axis, i, j, i, j, i + 1, j)
+
+
+@compiled
+def _jump(covers, number):
+    """How much more the cell before a side covers than that behind it; most of the time 0."""
+    _, _, _, a, b, c, d = _beside(number)
+    return covers[a, b] - covers[c, d]
+
+
+@compiled
+def _side(jump, depths, row, planes, x, y, number):
+    """A side between two of the cells around a point, by its number; for `jump` see `_jump`.
 
     Returns how much the result changes as the side moves along its axis; the axis; the sample of the nearer cell; how
     far the side lies beyond its centre; and the sample of the cell within.
     """
     height, width = planes.shape[1:]
     top, left = _corner(y, height), _corner(x, width)
-    axis, i, j = number // 12, number % 12 // 4, number % 4
-    a, b, c, d = (j, i, j, i + 1) if axis == 0 else (i, j, i + 1, j)
-    jump = covers[a, b] - covers[c, d]
-    if jump == 0:
-        return 0.0, axis, 0, 0.0, 0
+    axis, i, j, a, b, c, d = _beside(number)
     across, along = (x - left, y - top) if axis == 0 else (y - top, x - left)
     if depths[a, b] < depths[c, d]:
         y_cell, x_cell, side, step = top + a, left + b, 2 * axis + 5, -1
@@ -217,14 +225,14 @@ def _cell(x, y, row, number):
 
 
 @loop
-def _forward(start, stop, samples, points, row, planes, lens, opaque, out, kept):
-    covers, depths, fronts = _tables()
+def _forward(start, stop, picture, points, out, kept):
+    (samples, row, planes, lens, opaque), (covers, depths, fronts) = picture, _tables()
     for n in range(start, stop):
         x, y, depth = _placed(points, n, planes, lens)
         out[n, 0], kept[n] = 0, False
         if depth == -FAR or not _some_front(x, y, depth, planes):
             continue
-        if not _look(samples, x, y, depth, row, planes, opaque, covers, depths, fronts):
+        if not _look(samples, (x, y, depth), row, planes, opaque, covers, depths, fronts):
             continue
         even = True
         for c in range(1, 16):
@@ -238,15 +246,18 @@ def _forward(start, stop, samples, points, row, planes, lens, opaque, out, kept)
 
 
 @loop
-def _push(start, stop, samples, points, row, planes, lens, opaque, t_samples, t_points, kept, out):
-    covers, depths, fronts = _tables()
+def _push(start, stop, picture, points, t_samples, t_points, kept, out):
+    (samples, row, planes, lens, opaque), (covers, depths, fronts) = picture, _tables()
     for n in range(start, stop):
-        x, y, depth = _placed(points, n, planes, lens)
+        x, y, _ = at = _placed(points, n, planes, lens)
         out[n, 0], total = 0, 0.0
-        if not kept[n] or not _look(samples, x, y, depth, row, planes, opaque, covers, depths, fronts):
+        if not kept[n] or not _look(samples, at, row, planes, opaque, covers, depths, fronts):
             continue
         for s in range(SIDES):
-            change, axis, sample, beyond, within = _side(covers, depths, row, planes, x, y, s)
+            jump = _jump(covers, s)
+            if jump == 0:
+                continue
+            change, axis, sample, beyond, within = _side(jump, depths, row, planes, x, y, s)
             if change != 0:
                 moved = t_samples[sample, axis] - t_points[n, axis]
                 total += change * (moved + beyond * (t_samples[sample, axis] - t_samples[within, axis]))
@@ -259,14 +270,17 @@ def _push(start, stop, samples, points, row, planes, lens, opaque, t_samples, t_
 
 
 @loop
-def _pull(samples, points, row, planes, lens, opaque, g, g_samples, g_points, kept):
-    covers, depths, fronts = _tables()
+def _pull(picture, points, g, g_samples, g_points, kept):
+    (samples, row, planes, lens, opaque), (covers, depths, fronts) = picture, _tables()
     for n in range(len(points)):
-        x, y, depth = _placed(points, n, planes, lens)
-        if not kept[n] or g[n, 0] == 0 or not _look(samples, x, y, depth, row, planes, opaque, covers, depths, fronts):
+        x, y, _ = at = _placed(points, n, planes, lens)
+        if not kept[n] or g[n, 0] == 0 or not _look(samples, at, row, planes, opaque, covers, depths, fronts):
             continue
         for s in range(SIDES):
-            change, axis, sample, beyond, within = _side(covers, depths, row, planes, x, y, s)
+            jump = _jump(covers, s)
+            if jump == 0:
+                continue
+            change, axis, sample, beyond, within = _side(jump, depths, row, planes, x, y, s)
             if change != 0:
                 change *= g[n, 0]
                 g_samples[sample, axis] += change * (1 + beyond)

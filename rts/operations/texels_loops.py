@@ -6,6 +6,7 @@ Operands are those of `rts.operations.texels.TEXELS`. Gradients of texels are ad
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,73 +19,66 @@ FAR = 2.0**53
 """Texels farther out count as this one, which is as an integer is."""
 
 
+class Lookups(NamedTuple):
+    """Places in images, and how these go on outside.
+
+    Attributes:
+        uv: (N, 2) float.
+        image: (N,) int32, which image each lookup is of; (0,) where all are of the first.
+        places: (L, 3) int32, see `places_of`.
+        wraps: the continuations along u and v, see `WRAPS`.
+        nearest: whether texels are not interpolated.
+    """
+
+    uv: np.ndarray
+    image: np.ndarray
+    places: np.ndarray
+    wraps: tuple[int, int]
+    nearest: bool
+
+
 def places_of(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
     """Height, width and first row in the table (L, 3) int32 of images."""
     counts = np.array([height * width for height, width in sizes])
     return np.stack([*np.array(sizes).T, np.cumsum(counts) - counts], axis=1).astype(np.int32)
 
 
-def forward(
-    table: np.ndarray,
-    uv: np.ndarray,
-    image: np.ndarray,
-    out: np.ndarray,
-    *,
-    sizes: tuple[tuple[int, ...], ...],
-    wrap: tuple[str, str],
-    filter: str,
-) -> None:
-    """Fill `out` (N, C) with the lookups."""
-    _parallel(_look_up, table, uv, image, sizes, wrap, filter, out)
+def forward(table: np.ndarray, uv: np.ndarray, image: np.ndarray, out: np.ndarray, **options: Any) -> None:
+    """Fill `out` (N, C) with the lookups. `options` are the parameters of `TEXELS`."""
+    _parallel(_look_up, _lookups(uv, image, **options), table, out)
 
 
-def push(
-    table: np.ndarray,
-    uv: np.ndarray,
-    image: np.ndarray,
-    t_table: np.ndarray | None,
-    t_uv: np.ndarray | None,
-    out: np.ndarray,
-    *,
-    sizes: tuple[tuple[int, ...], ...],
-    wrap: tuple[str, str],
-    filter: str,
-) -> None:
-    """Fill `out` (N, C) with the derivative along `t_table` (M, C) and `t_uv` (N, 2), each None if zero."""
+def push(table: np.ndarray, uv: np.ndarray, image: np.ndarray, *rest: Any, **options: Any) -> None:
+    """Fill the last of `rest`, out (N, C), with the derivative.
+
+    Before it are tangents of the table (M, C) and of uv (N, 2), each None if zero.
+    """
+    t_table, t_uv, out = rest
     if t_table is None:
         out[...] = 0
     else:
-        forward(t_table, uv, image, out, sizes=sizes, wrap=wrap, filter=filter)
-    if t_uv is not None and filter != "nearest":
-        _parallel(_add_moved, table, uv, image, sizes, wrap, filter, t_uv, out)
+        forward(t_table, uv, image, out, **options)
+    if t_uv is not None and options["filter"] != "nearest":
+        _parallel(_add_moved, _lookups(uv, image, **options), table, t_uv, out)
 
 
-def pull(
-    table: np.ndarray,
-    uv: np.ndarray,
-    image: np.ndarray,
-    g: np.ndarray,
-    g_table: np.ndarray | None,
-    g_uv: np.ndarray | None,
-    *,
-    sizes: tuple[tuple[int, ...], ...],
-    wrap: tuple[str, str],
-    filter: str,
-) -> None:
-    """Pull back the gradient `g` (N, C) of the result: fill `g_table` and `g_uv`, given as zeros, unless None."""
+def pull(table: np.ndarray, uv: np.ndarray, image: np.ndarray, g: np.ndarray, *results: Any, **options: Any) -> None:
+    """Pull back the gradient `g` (N, C) of the result: fill `results`, of table and uv, given as zeros, unless None."""
+    (g_table, g_uv), lookups = results, _lookups(uv, image, **options)
     if g_table is not None:
-        _scatter(uv, image, *_numbers(sizes, wrap, filter), g, g_table)
-    if g_uv is not None and filter != "nearest":
-        _parallel(_pull_uv, table, uv, image, sizes, wrap, filter, g, g_uv)
+        _scatter(lookups, g, g_table)
+    if g_uv is not None and not lookups.nearest:
+        _parallel(_pull_uv, lookups, table, g, g_uv)
 
 
-def _parallel(function, table, uv, image, sizes, wrap, filter, *others):
-    work = (30 + 6 * table.shape[1]) * len(uv)
-    parallel(function, len(uv), table, uv, image, *_numbers(sizes, wrap, filter), *others, work=work)
+def _lookups(uv, image, sizes, wrap, filter):
+    wraps = WRAPS.get(wrap[0], 0), WRAPS.get(wrap[1], 0)
+    return Lookups(uv, image, read_only(places_of(sizes)), wraps, filter == "nearest")
 
 
-def _numbers(sizes, wrap, filter):
-    return read_only(places_of(sizes)), WRAPS.get(wrap[0], 0), WRAPS.get(wrap[1], 0), filter == "nearest"
+def _parallel(function, lookups, table, *others):
+    count = len(lookups.uv)
+    parallel(function, count, lookups, table, *others, work=(30 + 6 * table.shape[1]) * count)
 
 
 @compiled
@@ -102,12 +96,20 @@ def _wrapped(index, count, wrap):
 
 
 @compiled
-def _found(uv, places, place, wrap_u, wrap_v, nearest, n):
-    """The four texels of lookup n in the image `place`, and the shares of the right and the lower ones."""
-    height, width, first = places[place, 0], places[place, 1], places[place, 2]
+def _place(lookups, n):
+    """Height, width and first row of the image of lookup n."""
+    image, places = lookups.image, lookups.places
+    place = image[n] if len(image) > 0 else 0
+    return places[place, 0], places[place, 1], places[place, 2]
+
+
+@compiled
+def _found(lookups, n):
+    """The four texels of lookup n, and the shares of the right and the lower ones."""
+    uv, (height, width, first), (wrap_u, wrap_v) = lookups.uv, _place(lookups, n), lookups.wraps
     real, half = uv.dtype.type, uv.dtype.type(0.5)
     x, y = uv[n, 0] * real(width) - half, (real(1) - uv[n, 1]) * real(height) - half
-    if nearest:
+    if lookups.nearest:
         x, y = np.floor(x + half), np.floor(y + half)
     x0, y0 = np.floor(x), np.floor(y)
     # NaN names some texel, and its shares are none.
@@ -128,12 +130,10 @@ def _any(g, n):
 
 
 @loop
-def _look_up(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, out):
+def _look_up(start, stop, lookups, table, out):
     """Fill rows [start, stop) of `out` (N, C)."""
-    several = len(image) > 0
     for n in range(start, stop):
-        place = image[n] if several else 0
-        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
+        a, b, c, d, fx, fy = _found(lookups, n)
         for k in range(table.shape[1]):
             upper = table[a, k] + fx * (table[b, k] - table[a, k])
             lower = table[c, k] + fx * (table[d, k] - table[c, k])
@@ -141,13 +141,12 @@ def _look_up(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, out
 
 
 @loop
-def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t_uv, out):
+def _add_moved(start, stop, lookups, table, t_uv, out):
     """Add to rows [start, stop) of `out` (N, C) the derivative along `t_uv` (N, 2)."""
-    several = len(image) > 0
     for n in range(start, stop):
-        place = image[n] if several else 0
-        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
-        right, down = t_uv[n, 0] * places[place, 1], -t_uv[n, 1] * places[place, 0]
+        a, b, c, d, fx, fy = _found(lookups, n)
+        height, width, _ = _place(lookups, n)
+        right, down = t_uv[n, 0] * width, -t_uv[n, 1] * height
         for k in range(table.shape[1]):
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
             falls = table[c, k] + fx * lower - table[a, k] - fx * upper
@@ -155,31 +154,29 @@ def _add_moved(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, t
 
 
 @loop
-def _pull_uv(start, stop, table, uv, image, places, wrap_u, wrap_v, nearest, g, g_uv):
+def _pull_uv(start, stop, lookups, table, g, g_uv):
     """Fill rows [start, stop) of `g_uv` (N, 2) from `g` (N, C)."""
-    several = len(image) > 0
     for n in range(start, stop):
         if not _any(g, n):
             continue
-        place = image[n] if several else 0
-        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
+        a, b, c, d, fx, fy = _found(lookups, n)
         right = down = g.dtype.type(0)
         for k in range(table.shape[1]):
             upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
             right += g[n, k] * (upper + fy * (lower - upper))
             down += g[n, k] * (table[c, k] + fx * lower - table[a, k] - fx * upper)
-        g_uv[n, 0], g_uv[n, 1] = right * places[place, 1], -down * places[place, 0]
+        height, width, _ = _place(lookups, n)
+        g_uv[n, 0], g_uv[n, 1] = right * width, -down * height
 
 
 @loop
-def _scatter(uv, image, places, wrap_u, wrap_v, nearest, g, g_table):
+def _scatter(lookups, g, g_table):
     """Add to `g_table` (M, C) the gradient of the texels, from `g` (N, C)."""
-    one, several = g.dtype.type(1), len(image) > 0
-    for n in range(len(uv)):
+    one = g.dtype.type(1)
+    for n in range(len(lookups.uv)):
         if not _any(g, n):
             continue
-        place = image[n] if several else 0
-        a, b, c, d, fx, fy = _found(uv, places, place, wrap_u, wrap_v, nearest, n)
+        a, b, c, d, fx, fy = _found(lookups, n)
         for k in range(g.shape[1]):
             x = g[n, k]
             g_table[a, k] += (one - fx) * (one - fy) * x

@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import LITTLE_WORK, TASKS_PER_THREAD, parallel, read_only, thread_count
 from rts.contracts.records import Fragments
+
+
+class Packed(NamedTuple):
+    """Rows of samples, and the tables of triangles that they are filled from.
+
+    Attributes:
+        part_of: (T,) int32; no rows for a single part.
+        table: (T, I) int32.
+        corners: (T, 3, Q) float32, or no rows for the barycentrics.
+        ids: (N, I) int32, to fill.
+        params: (N, Q) float32, to fill.
+    """
+
+    part_of: np.ndarray
+    table: np.ndarray
+    corners: np.ndarray
+    ids: np.ndarray
+    params: np.ndarray
 
 
 def pack(
@@ -46,12 +64,17 @@ def pack(
     # Each piece of the cells is counted, then packed, by itself: how many there are changes nothing.
     pieces = 1 if 8 * count < LITTLE_WORK else min(thread_count() * TASKS_PER_THREAD, count)
     bounds, ahead = count * np.arange(pieces + 1) // pieces, np.zeros((pieces + 1, parts), np.int64)
-    cells, row, depth = _listed(fragments, kept), np.empty(kept.shape, np.int32), np.empty(kept.shape, np.float32)
-    parallel(_count, pieces, bounds, *cells[:2], owners, ahead, work=2 * count)
-    others = _listed(_NOTHING, _NOWHERE) if beside is None else _listed(beside, np.ones(beside.depth.shape, np.bool_))
-    more, last = len(others[0]), ahead[pieces:]
+    (there, cells), row, depth = (
+        _listed(fragments, kept),
+        np.empty(kept.shape, np.int32),
+        np.empty(kept.shape, np.float32),
+    )
+    parallel(_count, pieces, bounds, there, cells.triangle_ids, owners, ahead, work=2 * count)
+    beside = _NOTHING if beside is None else beside
+    all_there, others = _listed(beside, np.ones(beside.depth.shape, np.bool_))
+    more, last = len(all_there), ahead[pieces:]
     of_more, rows, depths = np.array([0, more]), np.empty(more, np.int32), np.empty(more, np.float32)
-    _count(0, 1, of_more, *others[:2], owners, last)
+    _count(0, 1, of_more, all_there, others.triangle_ids, owners, last)
     counts, firsts = np.empty(parts, np.int64), np.empty(parts, np.int64)
     used = _number(ahead, counts, firsts)
     total = capacity or used
@@ -61,9 +84,9 @@ def pack(
         for part in np.flatnonzero(counts == 0):
             triangle, stop = (0, len(table)) if starts is None else starts[part : part + 2]
             ids[firsts[part]], params[firsts[part]] = middle_of(table[:stop], corner_params, triangle)
-    known = owners, table, corners, ids, params
-    parallel(_pack, pieces, bounds, ahead, *cells, *known, row.reshape(-1), depth.reshape(-1), work=8 * count)
-    _pack(0, 1, of_more, last, *others, *known, rows, depths)
+    packed = Packed(owners, table, corners, ids, params)
+    parallel(_pack, pieces, bounds, ahead, there, cells, packed, row.reshape(-1), depth.reshape(-1), work=8 * count)
+    _pack(0, 1, of_more, last, all_there, others, packed, rows, depths)
     return counts, ids, params, row, depth, rows
 
 
@@ -71,7 +94,6 @@ _NO_PARTS, _NONE = np.empty(0, np.int32), read_only(np.empty((0, 3, 0), np.float
 """The parts of triangles where there is one; and parameters of corners where barycentrics are taken."""
 
 _NOTHING = Fragments(np.empty(0, np.int32), np.empty((0, 2), np.float32), np.empty(0, np.float32))
-_NOWHERE = np.empty(0, np.bool_)
 
 
 def in_one(tables: Sequence[np.ndarray], shifts: Sequence[int]) -> np.ndarray:
@@ -97,11 +119,12 @@ def owners_of(starts: np.ndarray) -> np.ndarray:
     return np.arange(len(starts) - 1, dtype=np.int32).repeat(starts[1:] - starts[:-1])
 
 
-def _listed(fragments: Fragments, kept: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Which fragments are kept, their triangles, barycentrics and depths, one after the other."""
+def _listed(fragments: Fragments, kept: np.ndarray) -> tuple[np.ndarray, Fragments]:
+    """Which fragments are kept, and the fragments, one after the other."""
     triangles, shares, depths = fragments
     arrays = read_only(triangles, np.int32), read_only(shares, np.float32), read_only(depths, np.float32)
-    return read_only(kept).reshape(-1), arrays[0].reshape(-1), arrays[1].reshape(-1, 2), arrays[2].reshape(-1)
+    flat = Fragments(arrays[0].reshape(-1), arrays[1].reshape(-1, 2), arrays[2].reshape(-1))
+    return read_only(kept).reshape(-1), flat
 
 
 def middle_of(table: np.ndarray, corner_params: np.ndarray | None, triangle: int) -> tuple[np.ndarray, Any]:
@@ -163,9 +186,7 @@ def param_at(corners, t, i, a, b):
 
 
 @loop
-def _pack(
-    start, stop, bounds, ahead, there, triangles, shares, depths, part_of, table, corners, ids, params, row, depth
-):
+def _pack(start, stop, bounds, ahead, there, fragments, packed, row, depth):
     """Pack the samples of pieces [start, stop) of the cells; see `pack`. Those that find no row are left out.
 
     Args:
@@ -173,18 +194,13 @@ def _pack(
         stop: the piece after the last.
         bounds: (pieces + 1,), where each begins.
         ahead: (pieces, P) the next row of each part; counted up.
-        there: (M,) bool.
-        triangles: (M,) int32.
-        shares: (M, 2) barycentrics.
-        depths: (M,).
-        part_of: (T,) int32; no rows for a single part.
-        table: (T, I).
-        corners: (T, 3, Q), or no rows for the barycentrics.
-        ids: (N, I) to fill.
-        params: (N, Q) to fill.
+        there: (M,) bool, which fragments are taken.
+        fragments: M of them, one after the other.
+        packed: see `Packed`.
         row: (M,) to fill.
         depth: (M,) to fill.
     """
+    (triangles, shares, depths), (part_of, table, corners, ids, params) = fragments, packed
     plain, several = len(corners) == 0, len(part_of) > 0
     for piece in range(start, stop):
         for m in range(bounds[piece], bounds[piece + 1]):

@@ -34,13 +34,13 @@ def at_points(
     order = np.lexsort((points[:, 0], line))
     begins = np.searchsorted(line[order], np.arange(size[0] + 1))
     shape = layers, len(points)
-    ids, weights, depth = np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.full(shape, np.inf)
+    found = Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.full(shape, np.inf))
     arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size)
     faces = np.ascontiguousarray(proxy.faces, np.int32)
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-    points_loops.hits(*arguments, near_and_far(camera), camera.kept_sign(cull), vertices, faces, ids, weights, depth)
-    depth = np.where(ids >= 0, depth, 0).astype(np.float32)
-    return Fragments(ids[:, None], weights[:, None], depth[:, None])
+    points_loops.hits(*arguments, near_and_far(camera), camera.kept_sign(cull), vertices, faces, found)
+    ids, weights, depth = (x[:, None] for x in found)
+    return Fragments(ids, weights, np.where(ids >= 0, depth, 0).astype(np.float32))
 
 
 def pixel_rows(camera: Camera, size: tuple[int, int]) -> np.ndarray:

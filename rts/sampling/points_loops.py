@@ -35,7 +35,7 @@ def edge(corners, k, sign):
 
 
 @loop
-def hits(points, begins, order, rows, clip, keep, vertices, faces, ids, weights, depths):
+def hits(points, begins, order, rows, clip, keep, vertices, faces, found):
     """The K nearest triangles at points of the image, by depth, then by index.
 
     Args:
@@ -47,11 +47,10 @@ def hits(points, begins, order, rows, clip, keep, vertices, faces, ids, weights,
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        ids: (K, M) int32, filled with −1.
-        weights: (K, M, 2) float32 to fill with the first two barycentrics.
-        depths: (K, M) float64, filled with infinity.
+        found: `Fragments`: ids (K, M) int32, filled with −1; barycentrics (K, M, 2) float32, to fill; depths (K, M)
+            float64, filled with infinity.
     """
-    height, corners, box = len(begins) - 1, np.empty((3, 4)), np.empty(4)
+    (ids, weights, depths), height, corners, box = found, len(begins) - 1, np.empty((3, 4)), np.empty(4)
     for t in range(len(faces)):
         sign = corners_of(t, rows, vertices, faces, corners)
         if sign == 0 or sign * keep < 0:

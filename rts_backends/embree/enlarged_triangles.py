@@ -77,8 +77,7 @@ class Covers(NamedTuple):
         self.corners[3 * len(faces) :] = 0
         self.owners[len(faces) :] = 0
         places = len(faces) + np.cumsum(wanted, dtype=np.int64) - wanted
-        arguments = vertices, faces, sphere, wanted, places
-        parallel(_cover, len(faces), *arguments, self.corners, self.owners, self.margins, work=100 * len(faces))
+        parallel(_cover, len(faces), vertices, faces, sphere, wanted, places, self, work=100 * len(faces))
 
 
 @compiled
@@ -110,11 +109,12 @@ def _count(start, stop, vertices, faces, sphere, wanted):
 
 
 @loop
-def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
-    """Fill the corners, owners and margins of the covers of triangles [start, stop), see `Covers`.
+def _cover(start, stop, vertices, faces, sphere, wanted, places, covers):
+    """Fill the corners, owners and margins of the covers of triangles [start, stop).
 
     `places` (T,) are the indices of the first further covers.
     """
+    corners, owners, margins = covers.corners, covers.owners, covers.margins
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):
         a, b, c, area = _shape(vertices, faces, t, sphere, points)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -88,13 +88,14 @@ def _decide(t, state, work, vertices, faces):
 
 
 @compiled
-def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
-    """Insert a hit, triangle t at depth z, among the nearest in `depths`, `ids` and `sure`, by depth, then by triangle.
+def _insert(t, z, exact, state, nearest, work, vertices, faces):
+    """Insert a hit, triangle t at depth z, among the `nearest`, by depth, then by triangle.
 
-    These three (K,) change in place, as does their number of hits, `state[COUNT]`. Hits at nearly the same depth are
-    tested in float64 first, unless they are `exact` or `sure` already; earlier ones that fail are removed. Returns
-    False if the hit fails, is there already, or is not among the nearest.
+    These are depths, ids, and which of them are sure, all (K,). They change in place, as does their number of hits,
+    `state[COUNT]`. Hits at nearly the same depth are tested in float64 first, unless they are `exact` or sure already;
+    earlier ones that fail are removed. Returns False if the hit fails, is there already, or is not among the nearest.
     """
+    depths, ids, sure = nearest
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
         if ids[i] == t:
@@ -168,7 +169,7 @@ def _keep_nearest(arguments):
         found, z = _decide(t, state, work, vertices, faces)
         if not found:
             return
-    if not _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
+    if not _insert(t, z, exact, state, (depths, ids, sure), work, vertices, faces):
         return
     # Nothing beyond the K-th hit matters: an accepted hit ends the ray there.
     if state[COUNT] == layers:
@@ -188,37 +189,65 @@ def keep_nearest_address() -> int:
     return _compiled_filter().address
 
 
+class Target(NamedTuple):
+    """What rays are cast at.
+
+    Attributes:
+        intersect: address of rtcIntersect1.
+        filter_address: address of the intersection filter.
+        scene: Embree's handle.
+        sphere: (4,) centre and radius of the object; the scene is the object moved and scaled to the unit sphere.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3).
+        owners: see `Covers`.
+        margins: (T,), see `Covers`.
+    """
+
+    intersect: int
+    filter_address: int
+    scene: int
+    sphere: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    owners: np.ndarray
+    margins: np.ndarray
+
+
+class Eye(NamedTuple):
+    """Where rays come from.
+
+    Attributes:
+        matrix: (4, 4) to homogeneous pixels.
+        row: (4,) coefficients of linear depth, see `depth_of`.
+        ray_space: (8, 4): the camera's projection, and the inverse of its view.
+        planes: (4,) depths: nothing nearer than the first or beyond the second is seen; between the others no plane
+            clips.
+        keep: sign of the determinants of triangles to keep, those seen from the front; 0 keeps all.
+        size: (height, width) of the image.
+    """
+
+    matrix: np.ndarray
+    row: np.ndarray
+    ray_space: np.ndarray
+    planes: np.ndarray
+    keep: float
+    size: tuple[int, int]
+
+
 @loop
-def cast(
-    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep,
-    vertices, faces, owners, margins, width, height, points, triangle_ids, barycentrics, depths_out,
-):  # fmt: skip
+def cast(first, last, target, eye, points, fragments):
     """Fill the fragment arrays for tiles of pixels, or for pieces of the list `points`.
 
     Args:
         first: first tile or piece, of TILE² pixels.
         last: the tile or piece past the last.
-        intersect: address of rtcIntersect1.
-        filter_address: address of the intersection filter.
-        scene: Embree's handle.
-        matrix: (4, 4) to homogeneous pixels.
-        row: (4,) coefficients of linear depth, see `depth_of`.
-        ray_space: (8, 4): the camera's projection, and the inverse of its view.
-        object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
-        planes: (4,) depths: nothing nearer than the first or beyond the second is seen; between the others no plane
-            clips.
-        keep: sign of the determinants of triangles to keep, those seen from the front; 0 keeps all.
-        vertices: (V, 3) of the proxy.
-        faces: (T, 3).
-        owners: see `Covers`.
-        margins: (T,), see `Covers`.
-        width: the image's width.
-        height: the image's height.
+        target: `Target`.
+        eye: `Eye`.
         points: (M, 2) x and y of the positions to cast rays through; empty for all H · W pixels' centres.
-        triangle_ids: (K, M or H · W) to fill.
-        barycentrics: (K, M or H · W, 2) to fill.
-        depths_out: (K, M or H · W) to fill.
+        fragments: `Fragments` to fill: ids, barycentrics and depths of K layers, one point or pixel after the other.
     """
+    intersect, filter_address, scene, object_sphere, vertices, faces, owners, margins = target
+    (matrix, row, ray_space, planes, keep, (height, width)), (triangle_ids, barycentrics, depths_out) = eye, fragments
     layers = len(triangle_ids)
     at, (xs, ys) = np.empty(TILE * TILE, np.int64), np.empty((2, TILE * TILE))
     across = (width + TILE - 1) // TILE
@@ -272,9 +301,8 @@ def cast(
         for n in range(count):
             for c in range(3):
                 v = near_faces[n, c]
-                near_vertices[3 * n + c, 0] = vertices[v, 0]
-                near_vertices[3 * n + c, 1] = vertices[v, 1]
-                near_vertices[3 * n + c, 2] = vertices[v, 2]
+                for r in range(3):
+                    near_vertices[3 * n + c, r] = vertices[v, r]
         n = 0
         for k in range(layers):
             for p in range(pixels):

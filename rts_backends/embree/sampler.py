@@ -12,7 +12,7 @@ from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
 from rts_backends.embree.enlarged_triangles import Covers
 from rts_backends.embree.library import Scene
-from rts_backends.embree.loops import TILE, cast, keep_nearest_address
+from rts_backends.embree.loops import TILE, Eye, Target, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, pixel_matrix
 
 REFITS = 32
@@ -73,31 +73,15 @@ def _cast(
     """Fragments of `shape` (K, ·, ·) at `points` (M, 2); at all pixels' centres if there are none."""
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(points) // TILE**2) if len(points) else -(-height // TILE) * -(-width // TILE)
-    flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
-    arrays = *flat, np.empty((shape[0], count), np.float32)
-    parallel(
-        cast,
-        tiles,
-        prepared.scene.intersect,
-        keep_nearest_address(),
-        prepared.scene.handle,
-        pixel_matrix(camera, size),
-        -camera.view[2],
-        np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
-        prepared.sphere,
-        _planes(camera.projection),
-        camera.kept_sign(cull),
-        prepared.proxy.vertices,
-        prepared.proxy.faces,
-        prepared.covers.owners,
-        prepared.covers.margins,
-        width,
-        height,
-        points,
-        *arrays,
-    )
-    ids, barycentrics, depth = arrays
-    return Fragments(ids.reshape(shape), barycentrics.reshape(*shape, 2), depth.reshape(shape))
+    ids, depth = np.empty((shape[0], count), np.int32), np.empty((shape[0], count), np.float32)
+    flat = Fragments(ids, np.empty((shape[0], count, 2), np.float32), depth)
+    scene, covers, (vertices, faces, *_) = prepared.scene, prepared.covers, prepared.proxy
+    triangles = prepared.sphere, vertices, faces, covers.owners, covers.margins
+    target = Target(scene.intersect, keep_nearest_address(), scene.handle, *triangles)
+    space = np.concatenate([camera.projection, np.linalg.inv(camera.view)])
+    lens = pixel_matrix(camera, size), -camera.view[2], space, _planes(camera.projection)
+    parallel(cast, tiles, target, Eye(*lens, camera.kept_sign(cull), size), points, flat)
+    return Fragments(ids.reshape(shape), flat.barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 
 def _packed(proxy: Proxy) -> Proxy:

@@ -21,7 +21,7 @@ import numpy as np
 from rts import Camera, InputError, TriangleSampler, errors
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.exact_hits import corner_lists, correct, places
+from rts_backends.exact_hits import SeenTriangles, corner_lists, correct, places
 from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.raster.sampler import Raster
 from rts_backends.triangles import bounding_sphere, pixel_matrix
@@ -123,8 +123,9 @@ class OpenGL(TriangleSampler):
             np.empty((layers, height, width), np.float32),
         )
         proxy = prepared.proxy
-        scene = pixel_matrix(camera, size), -camera.view[2], keep, proxy.vertices, proxy.faces, *prepared.corners
-        parallel(correct, height, *scene, *fragments)
+        lens = pixel_matrix(camera, size), -camera.view[2], keep
+        seen = SeenTriangles(*lens, proxy.vertices, proxy.faces, *prepared.corners)
+        parallel(correct, height, seen, fragments)
         return fragments
 
     def _warn(self) -> None:

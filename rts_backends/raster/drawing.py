@@ -108,7 +108,7 @@ def _draw(items, geometry, top, end, width, farthest, layered):
     for start in range(0, len(items), BLOCK):
         block = items[start : start + BLOCK]
         _gather(block, rows, vertices, entries, points)
-        _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
+        _set_up(len(block), points, matrix, view_depth, keep, (top, end - 1), entries, numbers, clips)
         _leave_out(len(block), farthest, numbers, entries)
         _cover(len(block), entries, numbers, covers)
         count = 0
@@ -203,13 +203,13 @@ def _gather(block, rows, vertices, entries, points):
 
 
 @compiled(inline="always")
-def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
+def _set_up(count, points, m, view_depth, keep, band, entries, numbers, clips):
     """Compute the numbers (NUMBERS, BLOCK) of triangles, and mark in `clips` those that may need clipping.
 
-    In `entries`, each triangle's rows of pixels are cut to the band, `top` to `bottom`. A triangle of no area, or that
-    is culled, keeps no rows.
+    In `entries`, each triangle's rows of pixels are cut to the first and last of the `band`. A triangle of no area, or
+    that is culled, keeps no rows.
     """
-    corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
+    (top, bottom), corners, signs = band, np.empty((3, 4, BLOCK)), np.empty(BLOCK)
     for c in range(3):
         for b in range(count):
             px, py, pz = points[c, 0, b], points[c, 1, b], points[c, 2, b]

@@ -26,7 +26,7 @@ from rts_surfaces.implicit.casting import cast, per_level
 from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
 from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
-from rts_surfaces.implicit.lattice import Lattice, check_bounds
+from rts_surfaces.implicit.lattice import Interpolated, Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
 from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
@@ -245,12 +245,13 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         params = np.zeros((len(samples.ids), self.sample_widths[1]), np.float32)
         least = 0.0 if self.near_singular == "keep" else NEAR_SINGULAR * self._usual_difference(inputs)
         along_edges = self.motion == "edge"
-        isovalue, sign = self.field.level_of_values
-        arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
+        field = self._interpolated(values, lattice)
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max(initial=-1)) + 1
         results = points, params, least / lattice.step.max()
-        parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *results, work=300 * count)
+        parallel(
+            lattice_samples_loops.fill, count, field, band, samples.ids, samples.params, *results, work=300 * count
+        )
         if along_edges:
             params[:, 3:] = 0
             params[:, 3] = least if self.near_singular == "bound" else 0.0
@@ -268,19 +269,22 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         from rts_surfaces.implicit import lattice_outlines_loops
 
         lattice, count = self.field.lattice(inputs), len(depth)
-        isovalue, sign = self.field.level_of_values
-        values, where = np.ascontiguousarray(inputs["values"]).reshape(-1), (lattice.shape, lattice.low, lattice.step)
+        values = np.ascontiguousarray(inputs["values"]).reshape(-1)
         results = np.zeros((count, 2, 6), np.int32), np.zeros((count, 2, 16), np.float32), np.zeros(count, np.bool_)
         band = None
         if "corners" in inputs:
             corners = np.concatenate([inputs["corners"], inputs["inner"]])
             band = corners, *rows_by_place(inputs["numbers"][corners[:, 0]], lattice.shape)
-        arguments = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
-        arguments = *arguments, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
-        parallel(lattice_outlines_loops.outlines, count, *arguments, *results, work=4000 * count)
+        rays, beside = (x._replace(spread=np.asarray(x.spread, np.float64)) for x in (rays, beside))
+        arguments = (self._interpolated(values, lattice), band), rays, beside, depth.astype(np.float64), results
+        parallel(lattice_outlines_loops.outlines, count, *arguments, work=4000 * count)
         points, params, there = results
         ids, tables = self.field.in_tables(points, tables)
         return ids, params, there, tables
+
+    def _interpolated(self, values: np.ndarray, lattice: Lattice) -> Interpolated:
+        isovalue, sign = self.field.level_of_values
+        return Interpolated(values, float(values.dtype.type(isovalue)), sign, self.closed, lattice.fixed)
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
         """The median difference of the field between the ends of crossed edges; `proxy` keeps it for `refine`."""

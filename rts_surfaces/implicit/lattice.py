@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,38 @@ from rts.plugin_api.checks import check_numbers, is_count, quoted
 
 MOST_POINTS = 2**31 - 1
 """The largest number of points, which int32 must number."""
+
+
+class Spacing(NamedTuple):
+    """How the points of a lattice lie; hashable.
+
+    Attributes:
+        shape: (X, Y, Z).
+        low: the first point.
+        step: the distance of neighbours along each axis.
+    """
+
+    shape: tuple[int, ...]
+    low: tuple[float, ...]
+    step: tuple[float, ...]
+
+
+class Interpolated(NamedTuple):
+    """A field between the points of a lattice, as compiled loops take it.
+
+    Attributes:
+        values: (M,), of all lattice points, indexed by number, or of a band's points, indexed by row.
+        isovalue: see `marching_cubes.of_lattice`.
+        sign: see `marching_cubes.of_lattice`.
+        capped: whether the surface is closed at the bounds.
+        lattice: how its points lie.
+    """
+
+    values: np.ndarray
+    isovalue: float
+    sign: float
+    capped: bool
+    lattice: Spacing
 
 
 class Lattice:
@@ -48,9 +80,9 @@ class Lattice:
         return Lattice((self.low, self.low + extent), shape)
 
     @property
-    def fixed(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+    def fixed(self) -> Spacing:
         """Shape, first point and step, as Python's numbers."""
-        return self.shape, tuple(self.low.tolist()), tuple(self.step.tolist())
+        return Spacing(self.shape, tuple(self.low.tolist()), tuple(self.step.tolist()))
 
     @property
     def count(self) -> int:

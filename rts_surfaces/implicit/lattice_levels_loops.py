@@ -10,7 +10,7 @@ from rts_surfaces.implicit.narrow_band_loops import row_at
 
 
 @compiled
-def level_at(values, band, isovalue, sign, capped, shape, low, step, at, near, slope):
+def level_at(field, band, at, near, slope):
     """The level at a point, interpolated along each axis.
 
     Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds,
@@ -20,6 +20,7 @@ def level_at(values, band, isovalue, sign, capped, shape, low, step, at, near, s
     Returns:
         The level, the number of the cell's lowest corner, the cell's row in a band, and True if a cap decides.
     """
+    values, isovalue, sign, capped, (shape, low, step) = field
     side, beyond, base, cell = 0, -np.inf, 0, 0
     for i in range(3):
         place = (at[i] - low[i]) / step[i]
@@ -64,11 +65,12 @@ def step_along(start, direction, t, out):
 
 
 @compiled
-def tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params):
+def tetrahedron(field, band, base, cell, at, near, points, params):
     """Fill the four lattice points that interpolate at a point, their weights, the point, and its level.
 
     Changes `near`, the point's places in its cell.
     """
+    values, isovalue, shape = field.values, field.isovalue, field.lattice.shape
     number, last, left, level = base, 0, 1.0, 0.0
     for k in range(6):
         points[k], params[3 + k] = number, 0

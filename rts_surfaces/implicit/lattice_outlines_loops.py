@@ -111,9 +111,8 @@ def _towards(z, origin, direction, origins, directions, slope):
 @compiled
 def _write(field, at, near, slope, place, along, part, points, params):
     """Fill a sample that follows the level at `at`, from `place` (3,), by a part of the motion `along` (3,)."""
-    values, band, isovalue, _, _, shape, _, _ = field
     _, base, cell, cap = level_at(*field, at, near, slope)
-    tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params)
+    tetrahedron(*field, base, cell, at, near, points, params)
     for i in range(3):
         params[9 + i] = place[i]
         moved = 0.0 if cap else part * along[i]
@@ -123,20 +122,18 @@ def _write(field, at, near, slope, place, along, part, points, params):
 
 
 @compiled
-def _crossing(field, z, place, rays, slope, at, near, work, points, params):
+def _crossing(field, z, place, rays, slope, work, points, params):
     """Fill a pair of samples at the least levels of two rays, between which an outline passes.
 
     The outline is where the least level, linear between both rays, is zero.
 
     Args:
-        field: the first arguments of `level_at`.
+        field: `Interpolated`, and its band.
         z: camera depth of the first ray's least level.
         place: (3,), the place there, which both samples have.
         rays: origins and directions (3,) of the ray, and of its neighbour.
         slope: (3,), across the ray, of any length.
-        at: (3,), for work.
-        near: (3,), for work.
-        work: (2, 3), for work.
+        work: (4, 3), for work.
         points: (2, 6) int32, to be filled as in `lattice_samples_loops.fill`.
         params: (2, 16), to be filled.
 
@@ -144,17 +141,18 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
         1 for a pair; 0 where the outline does not pass between the rays, they are nearer than `NARROW`, or the levels
         beyond are unknown; −1 where levels bend so much that they say little about how the outline moves.
     """
-    step, unit, least, size, square, length = field[7], work[0], work[1], 0.0, 0.0, 0.0
+    (at, near, unit, least), narrowest = work, min(field[0].lattice.step)
+    size, square, length = 0.0, 0.0, 0.0
     for i in range(3):
         across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
         size, square = size + across * across, square + slope[i] * slope[i]
         length += rays[3][i] * rays[3][i]
-    if size < (NARROW * min(step)) ** 2:
+    if size < (NARROW * narrowest) ** 2:
         return 0
     length = np.sqrt(length)
     for i in range(3):
         unit[i] = rays[3][i] / length
-    t = _downhill(field, rays[2], unit, z * length, FIRST_DOWN * min(step), at, near, least)
+    t = _downhill(field, rays[2], unit, z * length, FIRST_DOWN * narrowest, at, near, least)
     if np.isnan(t):
         return 0
     step_along(rays[2], unit, t, least)
@@ -182,27 +180,7 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
 
 
 @loop
-def outlines(
-    start,
-    stop,
-    values,
-    band,
-    isovalue,
-    sign,
-    capped,
-    shape,
-    low,
-    step,
-    origins,
-    directions,
-    other_origins,
-    other_directions,
-    depth,
-    spread,
-    points,
-    params,
-    there,
-):
+def outlines(start, stop, field, rays, beside, depth, pairs):
     """Fill pairs of samples that tell how the outlines beside rays [start, stop) move.
 
     They stand at the least levels of the ray and of a neighbour that misses the surface, see `_crossing`; where there
@@ -211,26 +189,17 @@ def outlines(
     Args:
         start: the first ray.
         stop: the ray after the last.
-        values: see `lattice_samples_loops.fill`.
-        band: rows (C, 8) of the corners of a band's cells; and the rows of these cells, by the places of their lowest
-            corners, see `narrow_band.rows_by_place`. None without a band.
-        isovalue: see `fill`.
-        sign: see `fill`.
-        capped: True if the surface is closed at the bounds.
-        shape: see `fill`.
-        low: see `fill`.
-        step: see `fill`.
-        origins: (R, 3), of `rts.plugin_api.records.Rays`.
-        directions: (R, 3), also of `Rays`.
-        other_origins: (R, 8, 3), see `rts.TriangleSurface.refine_outlines`.
-        other_directions: (R, 8, 3), also.
+        field: `Interpolated`; and rows (C, 8) of the corners of a band's cells, with the rows of these cells by the
+            places of their lowest corners, see `narrow_band.rows_by_place`, or None without a band.
+        rays: (R,) `Rays`.
+        beside: (R, 8) `Rays`, see `rts.TriangleSurface.refine_outlines`.
         depth: (R,), depths of the surface's points on the rays.
-        spread: (2,), of `Rays`.
-        points: (R, 2, 6) int32, to be filled with the numbers of lattice points.
-        params: (R, 2, 16), zeros, to be filled as in `fill`, with barycentrics of zero.
-        there: (R,) bool, to be filled: rays that have a pair.
+        pairs: to be filled: numbers of lattice points (R, 2, 6) int32; params (R, 2, 16), zeros before, as in `fill`,
+            with barycentrics of zero; and (R,) bool, the rays that have a pair.
     """
-    field = values, band, isovalue, sign, capped, shape, low, step
+    points, params, there = pairs
+    (origins, directions, spread), (other_origins, other_directions, _) = rays, beside
+    step = field[0].lattice.step
     first, unit, at, near, place = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((2, 3))
     for n in range(start, stop):
@@ -255,8 +224,8 @@ def outlines(
         k = _towards(z, origins[n], directions[n], other_origins[n], other_directions[n], slope)
         found = 0
         if k >= 0:
-            rays = origins[n], directions[n], other_origins[n, k], other_directions[n, k]
-            found = _crossing(field, z, place, rays, slope, at, near, work, points[n], params[n])
+            two = origins[n], directions[n], other_origins[n, k], other_directions[n, k]
+            found = _crossing(field, z, place, two, slope, (at, near, work[0], work[1]), points[n], params[n])
         level = (levels[0] + levels[1]) / 2
         if found == 0 and b > 0 and level <= 0 and level * level < reach * reach * square:
             found = 1

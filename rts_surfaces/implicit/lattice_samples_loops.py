@@ -11,7 +11,8 @@ LARGEST = 1e38
 
 
 @compiled(inline="always")
-def _place(number, shape, low, step, out):
+def _place(number, lattice, out):
+    shape, low, step = lattice
     out[0] = low[0] + step[0] * (number // (shape[1] * shape[2]))
     out[1] = low[1] + step[1] * (number // shape[2] % shape[1])
     out[2] = low[2] + step[2] * (number % shape[2])
@@ -26,8 +27,9 @@ def corner(values, band, base, cell, i, shape):
 
 
 @compiled(inline="always")
-def _slope(values, band, cell, base, at, shape, low, step, caps, out):
+def _slope(field, band, cell, base, at, caps, out):
     """Fill the gradient (3,) of values interpolated within a cell; zero across sides that are capped."""
+    values, (shape, low, step) = field.values, field.lattice
     x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
     near_x = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
     near_y = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
@@ -49,19 +51,14 @@ def _slope(values, band, cell, base, at, shape, low, step, caps, out):
 
 
 @loop
-def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near, points, params, least):
+def fill(start, stop, field, band, ids, near, points, params, least):
     """Fill the lattice points and parameters of samples [start, stop).
 
     Args:
         start: the first sample.
         stop: the sample after the last.
-        values: (M,), of all lattice points, indexed by number, or of a band's points, indexed by row.
-        isovalue: see `marching_cubes.of_lattice`.
-        sign: see `marching_cubes.of_lattice`.
+        field: `Interpolated`.
         band: rows (C, 8) of the corners of a band's cells, and numbers (M,) of its points; None without one.
-        shape: (X, Y, Z).
-        low: (3,), the first point.
-        step: (3,), the distance of neighbours along each axis.
         ids: (N, 8) int32: the six ends of three edges, the cell, and its caps, see `marching_cubes.Triangles`.
         near: (N, 2), the first two barycentrics.
         points: (N, 6) int32, to be filled with the numbers of lattice points.
@@ -69,6 +66,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             its motion for each unit of level (3), and the weighted sum of the six values less the isovalue.
         least: lower bound for the slope, by whose square motions are divided.
     """
+    values, isovalue, sign, _, lattice = field
     a, b, at, slope = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(start, stop):
         params[n, 0], params[n, 1], params[n, 2] = near[n, 0], near[n, 1], 1 - near[n, 0] - near[n, 1]
@@ -81,8 +79,8 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             else:
                 number_a, number_b = np.int64(band[1][row_a]), np.int64(band[1][row_b])
             points[n, 2 * k], points[n, 2 * k + 1] = number_a, number_b
-            _place(number_a, shape, low, step, a)
-            _place(number_b, shape, low, step, b)
+            _place(number_a, lattice, a)
+            _place(number_b, lattice, b)
             f_a, f_b = np.float64(values[row_a]), np.float64(values[row_b])
             along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
             for i in range(3):
@@ -91,7 +89,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             level += share * ((1 - along) * (f_a - isovalue) + along * (f_b - isovalue))
         cell = np.int64(ids[n, 6])
         base = cell if band is None else np.int64(band[1][band[0][cell, 0]])
-        _slope(values, band, cell, base, at, shape, low, step, ids[n, 7], slope)
+        _slope(field, band, cell, base, at, ids[n, 7], slope)
         divisor = max(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2], least * least)
         for i in range(3):
             params[n, 9 + i] = at[i]

@@ -71,17 +71,61 @@ class Triangles(NamedTuple):
     differences: np.ndarray
 
 
-@functools.cache
-def cases() -> tuple[np.ndarray, np.ndarray]:
-    """For each case, the number of triangles (256,) uint8, and the edges (256, 5, 3) int8 that their corners lie on.
+class Levels(NamedTuple):
+    """Values at the points of a lattice, and which of these are inside; see `of_lattice`.
 
-    Bit i of the number of a case says whether corner i is inside. Places without a triangle hold −1.
+    Attributes:
+        values: (X, Y, Z) float32 or float64.
+        isovalue: in the dtype of the values.
+        sign: 1 or −1, also.
+        closed: whether the surface is capped at the lattice's boundary.
     """
+
+    values: np.ndarray
+    isovalue: np.floating
+    sign: np.floating
+    closed: bool
+
+
+class Mixed(NamedTuple):
+    """The cells whose corners differ in sign, layer by layer.
+
+    Attributes:
+        offsets: (layers, 3) int64, the numbers of mixed cells, vertices and triangles in the layers before.
+        cells: (C,) int64: y * (number of cells along z) + z within its layer.
+        codes: (C,) uint8, the case of each cell.
+        first: (layers, cells along y, cells along z) int32, set at mixed cells alone: eight times the number of the
+            first vertex that the cell owns, plus the bits of `marching_cubes_loops._crossed`.
+    """
+
+    offsets: np.ndarray
+    cells: np.ndarray
+    codes: np.ndarray
+    first: np.ndarray
+
+
+class Cases(NamedTuple):
+    """For each case, its triangles. Bit i of the number of a case says whether corner i is inside.
+
+    Attributes:
+        counts: (256,) uint8, the number of triangles.
+        edges: (256, 5, 3) int8, the edges that their corners lie on; −1 where there is no triangle.
+        ends: `EDGES`.
+    """
+
+    counts: np.ndarray
+    edges: np.ndarray
+    ends: np.ndarray
+
+
+@functools.cache
+def cases() -> Cases:
+    """The triangles of all cases."""
     counts, edges = np.zeros(256, np.uint8), np.full((256, 15), -1, np.int8)
     for case, word in enumerate(CASES.split()):
         corners = [int(edge, 16) for edge in word.strip("-")]
         counts[case], edges[case, : len(corners)] = len(corners) // 3, corners
-    return counts, edges.reshape(256, 5, 3)
+    return Cases(counts, edges.reshape(256, 5, 3), EDGES)
 
 
 def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: float, closed: bool) -> Triangles:
@@ -96,39 +140,26 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     """
     from rts_surfaces.implicit import marching_cubes_loops as loops
 
-    counts, edges = cases()
     values = np.ascontiguousarray(values)
-    layers = lattice.shape[0] + closed
+    layers, work = lattice.shape[0] + closed, (lattice.shape[0] + closed) * values[0].size
     tally = np.zeros((layers, 3), np.int64)
-    level = values.dtype.type(isovalue), values.dtype.type(sign)
-    field_arguments = values, *level, closed
-    parallel(loops.count, layers, *field_arguments, counts, tally, work=layers * values[0].size)
-    offsets = np.cumsum(tally, axis=0) - tally
-    mixed, vertices, triangles = (int(n) for n in tally.sum(axis=0))
-    cells, codes = np.empty(mixed, np.int64), np.empty(mixed, np.uint8)
+    levels = Levels(values, values.dtype.type(isovalue), values.dtype.type(sign), closed)
+    parallel(loops.count, layers, levels, cases().counts, tally, work=work)
+    count, vertices, triangles = (int(n) for n in tally.sum(axis=0))
     # Pages of it that lie away from the surface are never touched.
     first = np.empty((layers, lattice.shape[1] + closed, lattice.shape[2] + closed), np.int32)
-    ends, places = np.empty((vertices, 2), np.int32), np.empty((vertices, 3), np.float32)
-    differences = np.empty(vertices, np.float32)
-    vertex_arrays = cells, codes, first, ends, places, differences
-    parallel(
-        loops.vertices,
-        layers,
-        *field_arguments,
-        lattice.low,
-        lattice.step,
-        offsets,
-        *vertex_arrays,
-        work=layers * values[0].size,
+    mixed = Mixed(np.cumsum(tally, axis=0) - tally, np.empty(count, np.int64), np.empty(count, np.uint8), first)
+    found = Triangles(
+        np.empty((vertices, 3), np.float32),
+        np.empty((triangles, 3), np.int32),
+        np.empty((vertices, 2), np.int32),
+        np.empty(triangles, np.int32),
+        np.empty(triangles, np.int8),
+        np.empty(vertices, np.float32),
     )
-    faces = np.empty((triangles, 3), np.int32)
-    owners, caps = np.empty(triangles, np.int32), np.empty(triangles, np.int8)
-    face_arrays = faces, owners, caps
-    table = counts, edges, EDGES
-    parallel(
-        loops.faces, layers, values.shape, closed, offsets, cells, codes, first, *table, *face_arrays, work=50 * mixed
-    )
-    return Triangles(places, faces, ends, owners, caps, differences)
+    parallel(loops.vertices, layers, levels, lattice.fixed, mixed, found, work=work)
+    parallel(loops.faces, layers, levels, mixed, cases(), found, work=50 * count)
+    return found
 
 
 def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
@@ -139,7 +170,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
     from rts_surfaces.implicit import marching_cubes_loops as loops
     from rts_surfaces.implicit.distinct_loops import distinct
 
-    counts, edges = cases()
+    counts = cases().counts
     owners, corners, virtual, caps = _with_border(band, lattice, closed)
     inside = (band.values[corners] < 0) & ((virtual[:, None] >> np.arange(8) & 1) == 0)
     codes = (inside << np.arange(8)).sum(axis=1).astype(np.uint8)
@@ -148,7 +179,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
     per_cell = counts[codes].astype(np.int64)
     total = int(per_cell.sum())
     keys, pairs = np.empty(3 * total, np.int64), np.empty((3 * total, 2), np.int32)
-    loops.edges_of_cells(corners, virtual, codes, counts, edges, EDGES, keys, pairs)
+    loops.edges_of_cells(corners, virtual, codes, cases(), keys, pairs)
     kept, faces = distinct(keys)
     ends = np.empty((len(kept), 2), np.int32)
     ends[faces] = pairs

@@ -3,7 +3,7 @@
 Cells are processed layer by layer along x. Each cell owns the three edges that begin at its lowest corner, so that
 threads can work on different layers: the first loop counts, the second writes. So that every edge has an owner, there
 is one more cell along each axis than fit between the points; for a closed surface one lies before the first point, too.
-`of_lattice`, `Triangles`, `EDGES` and the cases' tables are in `rts_surfaces.implicit.marching_cubes`.
+`of_lattice` and the records are in `rts_surfaces.implicit.marching_cubes`.
 """
 
 from __future__ import annotations
@@ -72,6 +72,14 @@ def _mixed(codes, cells, found):
 
 
 @compiled
+def _room(shape, closed):
+    """Room for the signs of two planes, see `_signs`, and for the cases and the mixed cells of a row of cells."""
+    border = 2 if closed else 1
+    planes, cells = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8), shape[2] + border - 1
+    return planes, np.zeros((cells + 7) // 8 * 8, np.uint8), np.empty(cells, np.int64)
+
+
+@compiled
 def _crossed(code):
     """The crossed ones of the three edges that a cell owns, as bits 0 to 2 for x, y, z; from the cell's case `code`."""
     lowest = code & 1
@@ -85,7 +93,7 @@ def _is_real(x, y, z, shape, closed):
 
 
 @loop
-def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
+def count(start, stop, levels, triangles_of, tally):
     """Fill `tally` (layers, 3) with the numbers of mixed cells, vertices and triangles of layers `start` to `stop` − 1.
 
     A mixed cell is one whose corners differ in sign. A layer's vertices are those on the edges that its cells own.
@@ -93,19 +101,14 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
     Args:
         start: the first layer.
         stop: the layer after the last.
-        values: (X, Y, Z).
-        isovalue: see `of_lattice`.
-        sign: see `of_lattice`.
-        closed: see `of_lattice`.
+        levels: `Levels`.
         triangles_of: (256,), the number of triangles of each case.
         tally: (layers, 3) to be filled.
     """
+    values, isovalue, sign, closed = levels
     shape = values.shape
-    border = 2 if closed else 1
-    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
-    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
-    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    mixed_places = np.empty(cells_z, np.int64)
+    planes, codes, mixed_places = _room(shape, closed)
+    cells_y, cells_z = planes.shape[1] - 1, len(mixed_places)
     first = -1 if closed else 0
     _signs(values, isovalue, sign, closed, start + first, planes[0])
     for x in range(start, stop):
@@ -123,49 +126,21 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
 
 
 @loop
-def vertices(
-    start,
-    stop,
-    values,
-    isovalue,
-    sign,
-    closed,
-    origin,
-    step,
-    offsets,
-    cells,
-    codes_of,
-    first_of,
-    ends,
-    places,
-    differences,
-):
+def vertices(start, stop, levels, lattice, mixed, found):
     """List the mixed cells of layers `start` to `stop` − 1, and the vertices on the edges that they own.
 
     Args:
         start: the first layer.
         stop: the layer after the last.
-        values: (X, Y, Z).
-        isovalue: see `of_lattice`.
-        sign: see `of_lattice`.
-        closed: see `of_lattice`.
-        origin: (3,), the place of the first point.
-        step: (3,), the distance of neighbours along each axis.
-        offsets: (layers, 3), the numbers of mixed cells, vertices and triangles in the layers before.
-        cells: (C,) to be filled: y * (number of cells along z) + z within its layer.
-        codes_of: (C,) to be filled: the case of each of `cells`.
-        first_of: (layers, cells along y, cells along z), written at mixed cells alone: eight times the number of the
-            first vertex that the cell owns, plus the bits of `_crossed`.
-        ends: (V, 2) to be filled, see `Triangles`.
-        places: (V, 3) to be filled with `Triangles.vertices`.
-        differences: (V,) to be filled with `Triangles.differences`.
+        levels: `Levels`.
+        lattice: `Lattice.fixed`.
+        mixed: `Mixed`, of which all but `offsets` is to be filled.
+        found: `Triangles`, of which `vertices`, `ends` and `differences` are to be filled.
     """
+    (values, isovalue, sign, closed), (offsets, cells, codes_of, first_of) = levels, mixed
     shape = values.shape
-    border = 2 if closed else 1
-    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
-    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
-    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    mixed_places = np.empty(cells_z, np.int64)
+    planes, codes, mixed_places = _room(shape, closed)
+    cells_y, cells_z = planes.shape[1] - 1, len(mixed_places)
     shift = 1 if closed else 0
     _signs(values, isovalue, sign, closed, start - shift, planes[0])
     for x in range(start, stop):
@@ -180,17 +155,17 @@ def vertices(
                 cell += 1
                 first_of[x, y, z] = 8 * vertex + crossed
                 corner = x - shift, y - shift, z - shift
-                vertex = _place(vertex, crossed, corner, values, isovalue, origin, step, ends, places, differences)
+                vertex = _place(vertex, crossed, corner, values, isovalue, lattice, found)
 
 
 @compiled
-def _place(vertex, crossed, corner, values, isovalue, origin, step, ends, places, differences):
-    """Write rows of `ends`, `places` and `differences` for the vertices on the edges of a cell, from `vertex` on.
+def _place(vertex, crossed, corner, values, isovalue, lattice, found):
+    """Fill the rows of `found` for the vertices on the edges of a cell, from `vertex` on.
 
     `crossed` are the bits of `_crossed`; `corner` is the point (x, y, z) of the cell's lowest corner, −1 along an axis
     before the lattice. Other arguments are those of `vertices`. Returns the next free row.
     """
-    shape = values.shape
+    (shape, origin, step), places, ends, differences = lattice, found.vertices, found.ends, found.differences
     ax, ay, az = max(corner[0], 0), max(corner[1], 0), max(corner[2], 0)
     for axis in range(3):
         if not crossed >> axis & 1:
@@ -214,14 +189,14 @@ def _bit_count(x):
 
 
 @loop
-def faces(
-    start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
-):
-    """Fill `out` (T, 3), `owners` (T,) and `caps` (T,): `Triangles.faces`, `cells` and `caps` of some layers.
+def faces(start, stop, levels, mixed, cases, found):
+    """Fill the faces, cells and caps of the triangles `found` in some layers.
 
-    `shape` (X, Y, Z) is the lattice's. `cells`, `codes_of` and `first_of` are filled by `vertices`, which must have
-    seen all layers. Other arguments are those of `vertices` and of `edges_of_cells`.
+    `mixed` is filled by `vertices`, which must have seen all layers. Other arguments are those of `vertices`, and
+    `Cases`.
     """
+    shape, closed, out, owners, caps = levels.values.shape, levels.closed, found.faces, found.cells, found.caps
+    (offsets, cells, codes_of, first_of), (triangles_of, edges_of, edges) = mixed, cases
     cells_z = first_of.shape[2]
     shift = 1 if closed else 0
     for x in range(start, stop):
@@ -249,20 +224,18 @@ def faces(
 
 
 @loop
-def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
+def edges_of_cells(corners, virtual, codes, cases, keys, pairs):
     """Fill `keys` and `pairs`: the edges on which corners of triangles lie, cell by cell.
 
     Args:
         corners: (C, 8) int32, the rows of each cell's corners in a table of points; cells are in any order.
         virtual: (C,) uint8, a bit for each corner that lies beyond the lattice, next to the point in `corners`.
         codes: (C,) uint8, the case of each cell.
-        triangles_of: (256,), the number of triangles of each case.
-        edges_of: (256, 5, 3), the edge on which each corner of each of these triangles lies.
-        edges: (12, 2), see `EDGES` of `marching_cubes`.
+        cases: `Cases`.
         keys: (3 T,) to be filled, T triangles: a number for each edge, the same in all cells that share the edge.
         pairs: (3 T, 2) to be filled: the rows of the edge's ends; twice the same row if one end is virtual.
     """
-    n = 0
+    n, (triangles_of, edges_of, edges) = 0, cases
     for c in range(len(codes)):
         for i in range(triangles_of[codes[c]]):
             for k in range(3):

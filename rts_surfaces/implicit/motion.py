@@ -13,10 +13,7 @@ import numpy as np
 from rts import InputError, engine_of, namespace
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.operations import Operation, combine, take
-from rts_surfaces.implicit.lattice import Lattice
-
-Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
-"""Shape (X, Y, Z), first point and step of the lattice whose edges samples move along, as `Lattice.fixed`."""
+from rts_surfaces.implicit.lattice import Lattice, Spacing
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 """Columns of a sample's parameters: the weights of the six values, its position, and its motion for a unit of level."""
@@ -72,7 +69,7 @@ weights (6), the position (3), the motion (3), and the weighted sum of the value
 
 
 def _by_crossings(
-    values: Array, params: Array, rows: Array, numbers: Array, *, isovalue: float, lattice: Edges
+    values: Array, params: Array, rows: Array, numbers: Array, *, isovalue: float, lattice: Spacing
 ) -> Array:
     xp = namespace(values)
     six = xp.reshape(take(values[:, None], xp.reshape(rows, (-1,))), (-1, 6)) - isovalue

@@ -252,7 +252,11 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
         pairs = _Grid(evaluate, 2)
         for known in centres:
             pairs.give(*known)
-        rows, bounds = pairs.corners(blocks), (grid.counts, evaluate.step, lipschitz, slack, closed)
+        # How much the level may change to the corner across such axes; not at all to itself.
+        across = np.array(evaluate.step) * (np.arange(8)[:, None] >> np.arange(3) & 1)
+        reach = lipschitz * np.sqrt((across**2).sum(axis=1)) * (1 + blocks_loops.RELATIVE) + slack
+        reach[0] = -1
+        rows, bounds = pairs.corners(blocks), (grid.counts, reach, closed)
         blocks = loops.uncertain(blocks, numbers, levels, rows, pairs.values, *bounds)
         grid.give(pairs.numbers, pairs.values)
         grid.give(numbers, levels)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
-from rts_surfaces.implicit.blocks_loops import RELATIVE
 
 SHIFT = 2
 MASK = (1 << SHIFT) - 1
@@ -171,7 +170,7 @@ def _border(blocks, b, counts):
 
 
 @loop
-def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step, lipschitz, slack, closed):
+def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, reach, closed):
     """Halve blocks of two cells a side into cells, and choose those whose corners may differ in sign.
 
     Each cell of a block that is not cropped has the block's centre and one of its corners as opposite corners.
@@ -183,21 +182,14 @@ def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step,
         rows: (B, 8) int32, the indices into `values` of each block's corners.
         values: the levels at corners of blocks.
         counts: the number of cells along each axis.
-        step: the distances of neighbours along each axis.
-        lipschitz: how fast the level changes at most, per unit of length.
-        slack: how far a level may be off by rounding.
+        reach: (8,), how much the level may differ between corners of a cell, by the axes across which they lie, as
+            bits; −1 for none.
         closed: True if the surface is capped at the lattice's boundary: cells inside and at the boundary are chosen,
             too.
 
     Returns:
         Cells (K, 3) int32, none beyond the lattice.
     """
-    reach = np.empty(8)  # How much the level may change to the corner across such axes; not at all to itself.
-    for i in range(8):
-        square = 0.0
-        for a in range(3):
-            square += (step[a] * (i >> a & 1)) ** 2
-        reach[i] = lipschitz * np.sqrt(square) * (1 + RELATIVE) + slack if i > 0 else -1.0
     kept, count = np.empty((64, 3), np.int32), 0
     for b in range(len(blocks)):
         if count + 8 > len(kept):

@@ -54,8 +54,9 @@ class Bicubic(Geometry):
         ray_patch_loops.bounds(self.nets, bounds)
         ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
-        ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
-        arguments = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
+        rays = Rays(*(np.ascontiguousarray(x, np.float64) for x in rays))
+        patches = ray_patch_loops.Joined(self.powers, bounds, self.across, self.flips)
+        arguments = patches, ids, params, *lines, rays, LIMITS
         parallel(ray_patch_loops.meet, len(lines[0]), *arguments, work=200 * len(samples.ids))
         return samples.replace(ids=ids, params=params, row=row, depth=depth)
 

@@ -6,8 +6,28 @@ Patches are in the form of powers, see `rts_surfaces.patches.bicubic_loops`. It 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from rts_surfaces.patches.bicubic_loops import compiled, first, loop
+
+
+class Joined(NamedTuple):
+    """Patches, and which of them meet.
+
+    Attributes:
+        powers: (n, 3, 4, 4), the patches.
+        bends: (n, 3), the result of `bounds`. Where they prove that a step ends near enough to the ray, the surface is
+            not evaluated again.
+        across: (n, 4) int32, the result of `sides_across` of `rts_surfaces.patches.bicubic_patches`.
+        flips: (n, 4) bool, as in `rts_surfaces.patches.tiles.Tiles`.
+    """
+
+    powers: np.ndarray
+    bends: np.ndarray
+    across: np.ndarray
+    flips: np.ndarray
 
 
 @loop
@@ -48,7 +68,7 @@ def _crossed(across, flips, patch, u, v, inside):
     """The patch across the side beyond which (u, v) lies farthest, and (u, v) in it, `inside` away from the side.
 
     The patch is −1, and (u, v) unchanged, if (u, v) lies within its patch or nothing lies beyond the side. `across` and
-    `flips` (n, 4) are those of `meet`.
+    `flips` (n, 4) are those of `Joined`.
     """
     side, most = 0, -v
     if u - 1 > most:
@@ -76,7 +96,7 @@ def _crossed(across, flips, patch, u, v, inside):
 
 
 @loop
-def meet(start, stop, powers, bends, across, flips, ids, params, row, depth, origins, directions, spread, limits):
+def meet(start, stop, patches, ids, params, row, depth, rays, limits):
     """Newton's method: move params so that points lie on their rays; see `LIMITS` in `rts_surfaces.patches.parametric`.
 
     If the method ends beyond the edge of a patch, it goes on in the patch across this edge: triangles may be off the
@@ -85,20 +105,14 @@ def meet(start, stop, powers, bends, across, flips, ids, params, row, depth, ori
     Args:
         start: first of the L lines of cells, those of all layers.
         stop: one after the last.
-        powers: (n, 3, 4, 4), the patches.
-        bends: (n, 3), the result of `bends`. Where they prove that a step ends near enough to the ray, the surface is
-            not evaluated again.
-        across: (n, 4) int32, the result of `sides_across` of `rts_surfaces.patches.bicubic_patches`.
-        flips: (n, 4) bool, as in `rts_surfaces.patches.tiles.Tiles`.
+        patches: `Joined`.
         ids: (N, 1) int32, the patch of each sample; changed where the hit is on another patch.
         params: (N, 2) float32, the samples' start; changed, to 0 without a hit.
         row: (L, W) int32, the sample in each cell, −1 for none; becomes −1 where the sample's ray does not meet the
             surface.
         depth: (L, W) float32, to be filled with the depth of each hit, 0 where a ray does not meet the surface. Cells
             that have no sample at the start keep their number, which should be 0.
-        origins: (N, 3) float64.
-        directions: (N, 3) float64; the point at depth z is `origin + z direction`.
-        spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
+        rays: (N,) `Rays`, float64.
         limits: (5,): residual in pixels, largest number of steps on a patch, largest step in params, largest distance
             beyond the edge in params, how many edges may be crossed.
     """
@@ -107,18 +121,19 @@ def meet(start, stop, powers, bends, across, flips, ids, params, row, depth, ori
             n = row[y, x]
             if n < 0:
                 continue
-            met, z = _meet(n, powers, bends, across, flips, ids, params, origins, directions, spread, limits)
+            met, z = _meet(n, patches, ids, params, rays, limits)
             row[y, x], depth[y, x] = n if met else -1, z
             if not met:
                 params[n, 0], params[n, 1] = 0, 0
 
 
 @compiled
-def _meet(n, powers, bends, across, flips, ids, params, origins, directions, spread, limits):
+def _meet(n, patches, ids, params, rays, limits):
     """Move the patch `ids` and the params of sample n until its point lies on its ray; arguments as for `meet`.
 
     Returns True and the depth; or False and 0 without a hit, with `ids` and params unchanged.
     """
+    (powers, bends, across, flips), (origins, directions, spread) = patches, rays
     residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
     patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
     dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
+from rts_surfaces.patches.tiles import MOST
 
 COLLAPSED = 1e-6
 """Derivatives along s and t have no normal if the sine of their angle is at most this."""
@@ -126,35 +127,24 @@ def curves(start, stop, found, frames, along, out):
 
 
 @loop
-def outlines(
-    start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
-):
-    """Fill `chord`, `edge` and `facing`: allowed distances of triangles from the surface, in units of space.
+def outlines(start, stop, shapes, view, cone, wanted, allowed):
+    """Fill `allowed`: allowed distances of triangles from the surface, in units of space.
 
-    The view is a `ViewCell` of `rts_surfaces.patches.view_cells`. Out of a perspective view distances are infinite, and
-    `facing` is 0. No distance is below 1e-4 of the tile's radius.
+    Out of a perspective view distances are infinite, and `facing` is 0. No distance is below 1e-4 of the tile's radius.
 
     Args:
         start: first tile.
         stop: one after the last.
-        places: (n, G, G, 3), points on a grid of each tile.
-        normals: (n, G, G, 3), unit normals at these points, or zero.
-        bends: (n, 3), the result of `shapes`.
-        eye: (3,), or the unit direction towards the viewer if `parallel`.
-        toward: (3,) unit, from the middle of the surface to the eye.
-        parallel: True if rays are parallel.
-        aside: how far the eye may be off sideways; if `parallel`, how far the direction may be off.
-        depth: how far the eye may be off along `toward`.
-        spread: (2,), the width of a pixel: `spread[0]` if `parallel`, else `spread[1] d` at distance d from the eye.
-        cone: (5,): axis of the cone that holds the view, sine and cosine of half its angle; not used if `parallel`.
+        shapes: `tile_triangles.Shapes`.
+        view: `view_cells.ViewCell`.
+        cone: sine and cosine of the view's angle; not used where rays are parallel.
         wanted: (2,), the allowed distance in pixels where a tile may have an outline, and elsewhere.
-        chord: (n,) to be filled: the allowed distance for each tile.
-        edge: (n,) to be filled: the allowed distance for those of its edges that are outlines.
-        facing: (n,) int8 to be filled: 1 for a tile that faces the viewer everywhere, −1 for one that faces away
-            everywhere, else 0.
+        allowed: `tile_triangles.Allowed`.
     """
+    (normals, places, bends, _), (chord, edge, facing), (sine, cosine) = shapes, allowed, cone
+    eye, parallel, aside, depth, toward, spread, axis, _ = view
     grid, move = places.shape[1], aside + depth
-    faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
+    faces, way, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
     for t in range(start, stop):
         for c in range(3):
             middle[c] = places[t, :, :, c].mean()
@@ -162,20 +152,20 @@ def outlines(
         for i in range(grid):
             for j in range(grid):
                 for c in range(3):
-                    view[c] = places[t, i, j, c] - middle[c]
-                radius = max(radius, _dot(view, view))
+                    way[c] = places[t, i, j, c] - middle[c]
+                radius = max(radius, _dot(way, way))
         # Between points of the grid the surface bulges by less than over the whole tile.
         radius = math.sqrt(radius) + (bends[t, 0] + 2 * bends[t, 1] + bends[t, 2]) / 8
         nearest = np.inf
         if not parallel:
             for c in range(3):
-                view[c] = middle[c] - eye[c]
-            distance = math.sqrt(_dot(view, view))
+                way[c] = middle[c] - eye[c]
+            distance = math.sqrt(_dot(way, way))
             if distance > radius + move:
-                along = _dot(view, cone)
+                along = _dot(way, axis)
                 across = math.sqrt(max(distance * distance - along * along, 0.0))
                 # Out of the cone by more than its own size, and that of the cell of views.
-                if across * cone[4] - along * cone[3] > radius + move:
+                if across * cosine - along * sine > radius + move:
                     chord[t], edge[t], facing[t] = np.inf, np.inf, 0
                     continue
         least, most, jump = np.inf, -np.inf, 0.0
@@ -183,14 +173,14 @@ def outlines(
             for j in range(grid):
                 far, slack = 1.0, aside
                 for c in range(3):
-                    view[c] = eye[c] if parallel else eye[c] - places[t, i, j, c]
+                    way[c] = eye[c] if parallel else eye[c] - places[t, i, j, c]
                 if not parallel:
-                    far = math.sqrt(_dot(view, view))
+                    far = math.sqrt(_dot(way, way))
                     nearest = min(nearest, far - move)
                     # Movement along the line of sight does not turn it.
-                    ahead = _dot(view, toward)
+                    ahead = _dot(way, toward)
                     slack += depth * math.sqrt(max(far * far - ahead * ahead, 0.0)) / far if far > 0 else depth
-                faces[i, j] = _dot(normals[t, i, j], view) / far if far > 0 else 0.0
+                faces[i, j] = _dot(normals[t, i, j], way) / far if far > 0 else 0.0
                 slack = 1.0 if far <= move and not parallel else min(1.0, slack / far)
                 least, most = min(least, faces[i, j] - slack), max(most, faces[i, j] + slack)
         for i in range(grid):
@@ -204,23 +194,20 @@ def outlines(
 
 
 @loop
-def rates(bends, curvature, chord, edge, facing, sides, least, most, inner, edges):
+def rates(shapes, allowed, sides, least, inner, edges):
     """Fill the numbers of pieces into which tiles and edges are cut: inner (n, 2) along s and t, edges (E,).
 
-    All are 1 to `most`. Tiles out of view have 1, or `least` if a neighbour cuts one of their edges.
+    All are 1 to `MOST`. Tiles out of view have 1, or `least` if a neighbour cuts one of their edges.
 
     Args:
-        bends: (n, 3), as in `shapes`.
-        curvature: (E,), the result of `curvature`.
-        chord: (n,), how far triangles of a tile may be off the surface; infinity out of view.
-        edge: (n,), how far triangles may be off at those edges of a tile that are outlines.
-        facing: (n,) int8, as in `outlines`.
+        shapes: `tile_triangles.Shapes`.
+        allowed: `tile_triangles.Allowed`.
         sides: (n, k) int32, the edge of each side.
         least: the least rate within a tile that is cut.
-        most: the largest rate.
         inner: (n, 2) int32, to be filled.
         edges: (E,) int32, to be filled.
     """
+    bends, curvature, (chord, edge, facing) = shapes.bends, shapes.curves, allowed
     fine, finest, width = np.full(len(edges), np.inf), np.full(len(edges), np.inf), sides.shape[1]
     beside, front, back = np.zeros(len(edges), np.int32), np.zeros(len(edges), np.bool_), np.zeros(len(edges), np.bool_)
     for t in range(len(bends)):
@@ -236,7 +223,7 @@ def rates(bends, curvature, chord, edge, facing, sides, least, most, inner, edge
             fine[e] = min(fine[e], finest[e])
         edges[e] = 1
         if fine[e] < np.inf and curvature[e] > 0:
-            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curvature[e] / (8 * fine[e]))))))
+            edges[e] = int(min(MOST, max(1.0, math.ceil(math.sqrt(curvature[e] / (8 * fine[e]))))))
     for t in range(len(bends)):
         allowed = chord[t]
         ru, rv = 1.0, 1.0
@@ -250,7 +237,7 @@ def rates(bends, curvature, chord, edge, facing, sides, least, most, inner, edge
                 ru, rv = ru * grow, rv * grow
         if width == 3:
             ru = rv = max(ru, rv)
-        inner[t, 0], inner[t, 1] = int(min(most, math.ceil(ru))), int(min(most, math.ceil(rv)))
+        inner[t, 0], inner[t, 1] = int(min(MOST, math.ceil(ru))), int(min(MOST, math.ceil(rv)))
         for s in range(width):
             # Cut alike, a side and what lies within make no long triangles.
             if chord[t] <= fine[sides[t, s]] and allowed < np.inf:

@@ -10,7 +10,7 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel
-from rts_surfaces.patches.tiles import CORNERS, MOST, Points, Tiles
+from rts_surfaces.patches.tiles import CORNERS, Points, Tiles
 from rts_surfaces.patches.view_cells import ViewCell
 
 MOST_TRIANGLES = 2**27
@@ -111,6 +111,24 @@ class Allowed(NamedTuple):
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
+class Cut(NamedTuple):
+    """How tiles are cut, and where what they are cut into begins. int32.
+
+    Attributes:
+        edges: (E,), into how many pieces each edge is cut.
+        edge_first: (E + 1,), the first of the vertices within each edge.
+        inner: (n, 2), into how many pieces each tile is cut along s and t.
+        inner_first: (n + 1,), the first of the vertices within each tile.
+        first: (n + 1,), the first triangle of each tile.
+    """
+
+    edges: np.ndarray
+    edge_first: np.ndarray
+    inner: np.ndarray
+    inner_first: np.ndarray
+    first: np.ndarray
+
+
 def allowed_in(view: ViewCell, tile_shapes: Shapes, fine: float, coarse: float) -> Allowed:
     """The allowed distances of triangles from the surface in a view.
 
@@ -124,24 +142,20 @@ def allowed_in(view: ViewCell, tile_shapes: Shapes, fine: float, coarse: float) 
 
     count, angle = len(tile_shapes.bends), min(view.angle, math.pi / 2)
     allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
-    cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
-    seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
-    arguments = tile_shapes.places, tile_shapes.normals, tile_shapes.bends, *seen
-    parallel(tile_rates_loops.outlines, count, *arguments, *allowed, work=500 * count)
+    arguments = tile_shapes, view, (math.sin(angle), math.cos(angle)), (fine, coarse), allowed
+    parallel(tile_rates_loops.outlines, count, *arguments, work=500 * count)
     return allowed
 
 
 def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
     """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep allowed distances, by estimate.
 
-    No rate is above `MOST`, even if distances are then exceeded.
+    No rate is above `tiles.MOST`, even if distances are then exceeded.
     """
     from rts_surfaces.patches import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    tile_rates_loops.rates(
-        tile_shapes.bends, tile_shapes.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
-    )
+    tile_rates_loops.rates(tile_shapes, allowed, tiles.sides, LEAST[tiles.sides.shape[1]], inner, edges)
     return edges, inner
 
 
@@ -187,8 +201,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     tiles_loops.counts(inner, tiles.sides, edges, first)
     out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
     loop = tiles_loops.quadrilaterals if width == 4 else tiles_loops.triangles
-    arguments = *tiles[:5], edges, edge_first, inner, inner_first, first
-    parallel(loop, count, *arguments, out, work=30 * total)
+    parallel(loop, count, tiles, Cut(edges, edge_first, inner, inner_first, first), out, work=30 * total)
     return Proxy(vertices, *out)
 
 

@@ -5,6 +5,8 @@ Tiles, their tables and their local coordinates are those of `rts_surfaces.patch
 
 from __future__ import annotations
 
+import numpy as np
+
 from rts.plugin_api.loops import compiled, loop
 
 # ------------------------------------------------------------------------------------------ points and counts
@@ -107,97 +109,78 @@ def counts(inner, sides, edges, first):
 
 
 @compiled
-def _set(faces, params, t, place, vertex, frame, x, y):
-    faces[t, place] = vertex
-    for c in range(2):
-        params[t, place, c] = frame[0, c] + x * frame[1, c] + y * frame[2, c]
+def _set(faces, params, t, frame, points):
+    """Set the corners of triangle t: three points, each a vertex and its local coordinates in a tile's `frame`."""
+    for k in range(3):
+        vertex, x, y = points[k]
+        faces[t, k] = vertex
+        for c in range(2):
+            params[t, k, c] = frame[0, c] + x * frame[1, c] + y * frame[2, c]
 
 
 @compiled
-def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """Set corner `place` of triangle t, in `faces` and `params`, to point k of a side of tile n.
+def _outer(corners, flips, n, side, k, cuts, base):
+    """Point k of a side of tile n.
 
-    Points count around the tile: 0 is corner `side`, `cuts` is the next corner. `frame` (3, 2) is the tile's, `corners`
-    and `flips` (n, width) are those of all tiles, and `base` is the first vertex within the side's edge.
+    Points count around the tile: 0 is corner `side`, `cuts` is the next corner. `corners` and `flips` (n, width) are
+    those of all tiles, and `base` is the first vertex within the side's edge.
     """
     width = corners.shape[1]
     if k == 0 or k == cuts:
-        vertex = corners[n, side if k == 0 else (side + 1) % width]
+        vertex = np.int64(corners[n, side if k == 0 else (side + 1) % width])
     else:
-        vertex = base + (cuts - k if flips[n, side] else k) - 1
+        vertex = np.int64(base + (cuts - k if flips[n, side] else k) - 1)
     z = k / cuts
     if width == 3:
         x, y = (z, 0.0) if side == 0 else (1 - z, z) if side == 1 else (0.0, 1 - z)
     else:
         x, y = (z, 0.0) if side == 0 else (1.0, z) if side == 1 else (1 - z, 1.0) if side == 2 else (0.0, 1 - z)
-    _set(faces, params, t, place, vertex, frame, x, y)
+    return vertex, x, y
 
 
 @compiled
-def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
-    _set(faces, params, t, place, base + (i - 1) * (rt - 1) + j - 1, frame, i / rs, j / rt)
+def _square_point(i, j, rs, rt, base):
+    return np.int64(base + (i - 1) * (rt - 1) + j - 1), i / rs, j / rt
 
 
 @compiled
-def _square(faces, params, t, i, j, rs, rt, frame, base):
-    """Set both triangles, t and t + 1, of a cell between points within a tile. Returns t + 2.
-
-    The cell's lowest point is (i, j), counted along s and t from (1, 1); border points of the tile have 0, rs or rt.
-    `base` is the first of the vertices within the tile.
-    """
-    for half in range(2):
-        for k in range(3):
-            # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
-            c = (k + 2 * half) % 4
-            x, y = i + (1 if c == 1 or c == 2 else 0), j + (1 if c >= 2 else 0)
-            _square_point(faces, params, t + half, k, x, y, rs, rt, frame, base)
-    return t + 2
-
-
-@compiled
-def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """Set corner `place` of triangle t to point m of those within a tile that lie next to a side.
+def _square_ring(side, m, rs, rt, base):
+    """Point m of those within a tile that lie next to a side.
 
     Along the side, in its direction around the tile, m counts from 1. `base` is the first vertex within the tile.
     """
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
-    _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
+    return _square_point(i, j, rs, rt, base)
 
 
 @loop
-def quadrilaterals(
-    start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out
-):
+def quadrilaterals(start, stop, tiles, cut, out):
     """Write the triangles of quadrilateral tiles `start` to before `stop`; two for a tile whose rates are 1.
 
     Args:
         start: first tile.
         stop: one after the last.
-        owner: (n,) int32, the patch of each tile.
-        frames: (n, 3, 2) float64, as in `Tiles`.
-        corners: (n, 4) int32, as in `Tiles`.
-        sides: (n, 4) int32, as in `Tiles`.
-        flips: (n, 4) bool, as in `Tiles`.
-        edges: (E,) int32, into how many pieces each edge is cut.
-        edge_first: (E + 1,) int32, the first of the vertices within each edge.
-        inner: (n, 2) int32, into how many pieces each tile is cut along s and t.
-        inner_first: (n + 1,) int32, the first of the vertices within each tile.
-        first: (n + 1,) int32, the first triangle of each tile.
+        tiles: `Tiles`.
+        cut: `tile_triangles.Cut`.
         out: the arrays to be filled: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32, see `Proxy`.
     """
-    faces, ids, params = out
+    (faces, ids, params), corners, sides, flips = out, tiles.corners, tiles.sides, tiles.flips
+    edges, edge_first, inner, inner_first, first = cut
     for n in range(start, stop):
-        rs, rt, t, base, frame = inner[n, 0], inner[n, 1], first[n], inner_first[n], frames[n]
-        ids[t : first[n + 1], 0] = owner[n]
+        rs, rt, t, base, frame = inner[n, 0], inner[n, 1], first[n], inner_first[n], tiles.frames[n]
+        ids[t : first[n + 1], 0] = tiles.patch[n]
         if rs == 1:
-            for half in range(2):
-                for k in range(3):
-                    _outer(faces, params, t + half, k, n, (k + 2 * half) % 4, 0, 1, frame, corners, flips, 0)
+            a, c = _outer(corners, flips, n, 0, 0, 1, 0), _outer(corners, flips, n, 2, 0, 1, 0)
+            _set(faces, params, t, frame, (a, _outer(corners, flips, n, 1, 0, 1, 0), c))
+            _set(faces, params, t + 1, frame, (c, _outer(corners, flips, n, 3, 0, 1, 0), a))
             continue
         for i in range(1, rs - 1):
             for j in range(1, rt - 1):
-                t = _square(faces, params, t, i, j, rs, rt, frame, base)
+                a, c = _square_point(i, j, rs, rt, base), _square_point(i + 1, j + 1, rs, rt, base)
+                _set(faces, params, t, frame, (a, _square_point(i + 1, j, rs, rt, base), c))
+                _set(faces, params, t + 1, frame, (c, _square_point(i, j + 1, rs, rt, base), a))
+                t += 2
         for side in range(4):
             e, count = sides[n, side], rs if side % 2 == 0 else rt
             cuts = edges[e]
@@ -205,56 +188,55 @@ def quadrilaterals(
             k, m = 0, 1
             while k < cuts or m < count - 1:
                 outward = m == count - 1 or (k < cuts and (k + 1) * count * 2 <= (2 * m + 1) * cuts)
-                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, edge_first[e])
+                here, beside = (
+                    _outer(corners, flips, n, side, k, cuts, edge_first[e]),
+                    _square_ring(side, m, rs, rt, base),
+                )
                 if outward:
-                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, edge_first[e])
                     k += 1
+                    ahead = _outer(corners, flips, n, side, k, cuts, edge_first[e])
                 else:
-                    _square_ring(faces, params, t, 1, side, m + 1, rs, rt, frame, base)
-                _square_ring(faces, params, t, 2, side, m, rs, rt, frame, base)
-                if not outward:
                     m += 1
+                    ahead = _square_ring(side, m, rs, rt, base)
+                _set(faces, params, t, frame, (here, ahead, beside))
                 t += 1
 
 
 @compiled
-def _triangle_point(faces, params, t, place, i, j, r, frame, base):
-    row = (j - 1) * (r - 1) - (j - 1) * j // 2
-    _set(faces, params, t, place, base + row + i - 1, frame, i / r, j / r)
+def _triangle_point(i, j, r, base):
+    return np.int64(base + (j - 1) * (r - 1) - (j - 1) * j // 2 + i - 1), i / r, j / r
 
 
 @compiled
-def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
+def _triangle_ring(side, m, r, base):
     """As `_square_ring`, of a triangular tile with r pieces a side; m is from 1 to r − 2."""
     i = m if side == 0 else r - 1 - m if side == 1 else 1
     j = 1 if side == 0 else m if side == 1 else r - 1 - m
-    _triangle_point(faces, params, t, place, i, j, r, frame, base)
+    return _triangle_point(i, j, r, base)
 
 
 @loop
-def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
-    """Write the triangles of triangular tiles; arguments as for `quadrilaterals`, but (n, 3) corners, sides, flips.
+def triangles(start, stop, tiles, cut, out):
+    """Write the triangles of triangular tiles; arguments as for `quadrilaterals`.
 
     Of `inner` the first column alone is used.
     """
-    faces, ids, params = out
+    (faces, ids, params), corners, sides, flips = out, tiles.corners, tiles.sides, tiles.flips
+    edges, edge_first, inner, inner_first, first = cut
     for n in range(start, stop):
-        r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]
-        ids[t : first[n + 1], 0] = owner[n]
+        r, t, base, frame = inner[n, 0], first[n], inner_first[n], tiles.frames[n]
+        ids[t : first[n + 1], 0] = tiles.patch[n]
         if r == 1:
-            for k in range(3):
-                _outer(faces, params, t, k, n, k, 0, 1, frame, corners, flips, 0)
+            a, b = _outer(corners, flips, n, 0, 0, 1, 0), _outer(corners, flips, n, 1, 0, 1, 0)
+            _set(faces, params, t, frame, (a, b, _outer(corners, flips, n, 2, 0, 1, 0)))
             continue
         for j in range(1, r - 2):
             for i in range(1, r - 1 - j):
-                _triangle_point(faces, params, t, 0, i, j, r, frame, base)
-                _triangle_point(faces, params, t, 1, i + 1, j, r, frame, base)
-                _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                b, c = _triangle_point(i + 1, j, r, base), _triangle_point(i, j + 1, r, base)
+                _set(faces, params, t, frame, (_triangle_point(i, j, r, base), b, c))
                 t += 1
                 if i + j < r - 2:
-                    _triangle_point(faces, params, t, 0, i + 1, j, r, frame, base)
-                    _triangle_point(faces, params, t, 1, i + 1, j + 1, r, frame, base)
-                    _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                    _set(faces, params, t, frame, (b, _triangle_point(i + 1, j + 1, r, base), c))
                     t += 1
         for side in range(3):
             cuts = edges[sides[n, side]]
@@ -263,13 +245,12 @@ def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_fir
             k, m = 0, 1
             while k < cuts or m < r - 2:
                 outward = m == r - 2 or (k < cuts and (k + 1) * r <= (m + 1) * cuts)
-                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, base_edge)
+                here, beside = _outer(corners, flips, n, side, k, cuts, base_edge), _triangle_ring(side, m, r, base)
                 if outward:
-                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, base_edge)
                     k += 1
+                    ahead = _outer(corners, flips, n, side, k, cuts, base_edge)
                 else:
-                    _triangle_ring(faces, params, t, 1, side, m + 1, r, frame, base)
-                _triangle_ring(faces, params, t, 2, side, m, r, frame, base)
-                if not outward:
                     m += 1
+                    ahead = _triangle_ring(side, m, r, base)
+                _set(faces, params, t, frame, (here, ahead, beside))
                 t += 1

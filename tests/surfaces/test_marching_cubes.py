@@ -39,7 +39,7 @@ def random_values(seed):
 
 
 def test_the_cases_cut_the_edges_that_change_sign():
-    counts, edges = marching_cubes.cases()
+    counts, edges, _ = marching_cubes.cases()
     assert counts[0] == counts[255] == 0 and counts.sum() == 820
     for case in range(256):
         inside = np.array([case >> i & 1 for i in range(8)])
