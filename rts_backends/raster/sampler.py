@@ -20,7 +20,7 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster.drawing import BAND_ROWS, LISTED, draw
-from rts_backends.raster.selection import BLOCK, LIMIT, PER_CHUNK, project, select, sorted_list
+from rts_backends.raster.selection import BLOCK, LIMIT, PER_CHUNK, Projected, project, select, sorted_list
 from rts_backends.triangles import pixel_matrix
 
 
@@ -92,8 +92,9 @@ def _drawn(
     chunks, bands = -(-blocks // PER_CHUNK), -(-height // BAND_ROWS)
     # Threads should not write to neighbouring memory.
     spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, 2 * bands), np.int64)
-    geometry = faces, vertices, screen, matrix, height, width, step, keep, camera.kept_sign("back")
-    parallel(select, chunks, *geometry, (rows, spans, counts), work=10 * len(faces))
+    numbers = np.float32(step), np.float32(keep), np.float32(camera.kept_sign("back"))
+    projected = Projected(faces, vertices, screen, matrix, size, *numbers)
+    parallel(select, chunks, projected, (rows, spans, counts), work=10 * len(faces))
     triangles = sorted_list(keep, rows, spans, counts)
 
     numbers = np.empty((4, layers, height * width), np.float32)  # One array, not three: the system clears fewer pages.

@@ -53,6 +53,30 @@ class TriangleList(NamedTuple):
     rows: np.ndarray
 
 
+class Projected(NamedTuple):
+    """A mesh, and where its vertices lie on screen.
+
+    Attributes:
+        faces: (T, 3) uint32.
+        vertices: (V, 3) float32 or float64.
+        screen: (V,) int32, filled by `project`.
+        matrix: (4, 4), see `pixel_matrix`.
+        size: (height, width).
+        step: the unit of positions on screen, in pixels.
+        keep: sign of the determinants of triangles to list; 0 for both signs.
+        front: that of triangles seen from the front.
+    """
+
+    faces: np.ndarray
+    vertices: np.ndarray
+    screen: np.ndarray
+    matrix: np.ndarray
+    size: tuple[int, int]
+    step: np.float32
+    keep: np.float32
+    front: np.float32
+
+
 def sorted_list(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> TriangleList:
     """The list that `select` wrote to `rows`, `spans` and `counts`, sorted by bands of rows of pixels."""
     sums = np.add.reduce(counts, axis=0)
@@ -94,11 +118,10 @@ def project(first, last, vertices, m, screen):
 
 
 @loop
-def select(first, last, faces, vertices, screen, matrix, height, width, step, keep, front, made):
+def select(first, last, mesh, made):
     """List and count the triangles that may cover the centre of a pixel, and whose determinants may have a sign.
 
-    The search goes through chunks [first, last) of blocks of triangles. `keep` is the sign, 0 for both; `front` is that
-    of triangles seen from the front.
+    The search goes through chunks [first, last) of blocks of triangles of `mesh`, which is `Projected`.
 
     `made` is the list, to be filled: a row for each triangle (T, LISTED), where the rows of each chunk begin and end
     (chunks, 2), and the numbers of a chunk's triangles that touch each band, seen from the front and from behind
@@ -107,29 +130,29 @@ def select(first, last, faces, vertices, screen, matrix, height, width, step, ke
     """
     xy, box = np.empty((3, BLOCK), np.int32), np.empty((4, BLOCK), np.float32)
     clips, near, behind = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_)
-    near_ones, step = np.empty(BLOCK, np.uint32), np.float32(step)
-    signs = np.float32(keep), np.float32(front)
-    geometry, place = (vertices, matrix, height, width, step), first * CHUNK
+    found, faces, screen, place = (box, clips, near, behind), mesh.faces, mesh.screen, first * CHUNK
+    near_ones = np.empty(BLOCK, np.uint32)
     for chunk in range(first, last):
         made[1][chunk, 0] = place
         for start in range(chunk * CHUNK, min(len(faces), (chunk + 1) * CHUNK), BLOCK):
             block = faces[start : min(len(faces), start + BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            _look(len(block), xy, height, width, step, signs, box, clips, near, behind)
-            place = _append(chunk, start, block, near, box, clips, behind, near_ones, geometry, place, made)
+            _look(len(block), xy, mesh, found)
+            place = _append(chunk, start, block, found, near_ones, mesh, place, made)
         made[1][chunk, 1] = place
 
 
 @compiled(inline="always")
-def _look(count, xy, height, width, step, signs, box, clips, near, behind):
+def _look(count, xy, mesh, found):
     """Fill in each triangle's box of pixels, and marks: `clips`, it may need clipping; `near`, it is to be listed.
 
-    `xy` (3, ·) are the corners' positions of `project`. `box` (4, ·) gets first and last column, first and last row. A
-    triangle is `near` if it may cover a pixel's centre and may face as `keep`, the first of the `signs`, says, or if it
-    `clips`. It is `behind` if it is likely to be seen from there, by the second.
+    `xy` (3, ·) are the corners' positions of `project`. `found` are `box` (4, ·), which gets first and last column,
+    first and last row, and marks. A triangle is `near` if it may cover a pixel's centre and may face as `keep`
+    says, or if it `clips`. It is `behind` if it is likely to be seen from there, by `front`.
     """
-    keep, front = signs
+    (height, width), step, keep, front = mesh.size, mesh.step, mesh.keep, mesh.front
+    box, clips, near, behind = found
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -157,13 +180,13 @@ def _look(count, xy, height, width, step, signs, box, clips, near, behind):
 
 
 @compiled(inline="always")
-def _append(chunk, start, block, near, box, clips, behind, near_ones, geometry, place, made):
+def _append(chunk, start, block, found, near_ones, mesh, place, made):
     """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
 
     Left out are clipped ones that cover no centre. Returns the next free row.
     """
-    vertices, matrix, height, width, step = geometry
-    rows, _, counts = made
+    vertices, matrix, (height, width), step = mesh.vertices, mesh.matrix, mesh.size, mesh.step
+    (box, clips, near, behind), (rows, _, counts) = found, made
     count = 0
     for b in range(len(block)):
         near_ones[count] = b
