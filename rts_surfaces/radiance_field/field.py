@@ -62,7 +62,7 @@ class RadianceField:
         named = {".".join(map(str, place)): x for place, x in placed(self.on_host())}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, allow_pickle=False, **named)
+            np.savez(path, **named)
         except OSError as error:
             raise InputError(f"{path} cannot be written ({error.strerror}); choose another name or folder") from error
 
