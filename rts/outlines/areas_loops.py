@@ -19,12 +19,12 @@ def _point(place, x, y, along):
 
 
 @compiled(inline="always")
-def _add_term(terms, s, k, i, share, rates, p, t, dx, dy):
-    """Add a straight piece (dx, dy), at t on piece p of a ray, to the term of a segment's cell k, for jump i."""
+def _add_term(terms, s, k, i, share, rates, p, t, way):
+    """Add a straight piece, by `way` (x, y), at t on piece p of a ray, to the term of a segment's cell k, for jump i."""
     for r in range(4):
         rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
-        terms[s, k, i, r, 0] += rate * dy
-        terms[s, k, i, r, 1] -= rate * dx
+        terms[s, k, i, r, 0] += rate * way[1]
+        terms[s, k, i, r, 1] -= rate * way[0]
 
 
 @compiled(inline="always")
@@ -74,8 +74,8 @@ def _weigh_ray(terms, weight, length, s, i, n, side, ray, rates, other):
                 of_cell = sign * (right if east else 1 - right) * (below if south else 1 - below)
                 if of_cell != 0:
                     own, of_other = (1 - 0.5 * t * abs(other)) * of_cell, -0.5 * t * other * sign * of_cell
-                    _add_term(terms, s, k, i, own, rates, p, t, dx, dy)
-                    _add_term(terms, s, k, 1 - i, of_other, rates, p, t, dx, dy)
+                    _add_term(terms, s, k, i, own, rates, p, t, (dx, dy))
+                    _add_term(terms, s, k, 1 - i, of_other, rates, p, t, (dx, dy))
     return start
 
 

@@ -192,8 +192,12 @@ def _cut_at(s, other, origin, endpoints, place, corner):
 
 
 @compiled(inline="always")
-def _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner):
-    """The step to the segment, from `first` to `stop`, that one ends at or crosses, 0 for none; and its place there."""
+def _junction(cell, s, way, origin, endpoints, place, clock, junction, corner):
+    """The step to the segment of a dual cell that segment s ends at or crosses, 0 for none; and its place there.
+
+    `cell` are the first segment there, and the one after the last.
+    """
+    first, stop = cell
     step, on, least, nearest = 0, 0.0, np.inf, np.inf
     for other in range(first, stop):
         if endpoints[other, 1] < 0 or other == s:
@@ -251,7 +255,7 @@ def join_lone_ends(segments, neighbours, place, tangent):
             stop += 1
         for s in range(first, stop if stop > first + 1 else first):  # One alone in its dual cell meets none.
             way = _inward(row_of(tangent, endpoints[s, 0]), dual_sides[s, 0])
-            junction[s], on[s] = _junction(first, stop, s, way, origin, endpoints, place, clock, junction, corner)
+            junction[s], on[s] = _junction((first, stop), s, way, origin, endpoints, place, clock, junction, corner)
         lead, alone = -1, True
         for s in range(first, stop):
             if endpoints[s, 1] >= 0 or junction[s] != 0:

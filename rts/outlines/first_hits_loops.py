@@ -78,13 +78,12 @@ def _overtaken(spans, begin, stop, x, place):
 
 
 @compiled(inline="always")
-def _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts):
+def _first_hits(g, on_gap, spans, names, parts, ends, end_depth, pieces, starts):
     """The first hits along a gap: which span is the nearest, and from which place on. Returns their number.
 
     Args:
         g: the gap.
-        begin: its first span.
-        stop: the span after its last.
+        on_gap: its first span, and the one after its last.
         spans: see `crossings`.
         names: see `crossings`.
         parts: see `crossings`.
@@ -93,6 +92,7 @@ def _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, st
         pieces: (2 N + 4,) int64 or more for its N spans, to fill: spans, NOTHING, FIRST or SECOND.
         starts: (2 N + 4,) float64 or more, to fill: where they begin.
     """
+    begin, stop = on_gap
     room, n, place, until, x = 2 * (stop - begin) + 3, 0, 0.0, 1.0, NOTHING
     for k in range(2):
         _agree(spans, begin, stop, ends[g, k, 0] >= 0, end_depth[g, k], k)
@@ -237,7 +237,7 @@ def crossings(
         for k in range(2):
             y, x = gap[g, 0] + k * (1 - gap[g, 2]), gap[g, 1] + k * gap[g, 2]
             ends[g, k, 0], ends[g, k, 1], end_depth[g, k] = seen[y, x], triangle[y, x], depth[y, x]
-        n = _first_hits(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts)
+        n = _first_hits(g, (begin, stop), spans, names, parts, ends, end_depth, pieces, starts)
         rows[g], count, a = at, 0, 0
         for m in range(1, n):
             # A piece that is too short to count belongs to what comes after it.
