@@ -209,8 +209,8 @@ LOOPS = [
     Defect(
         "the boundary term along y has the sign of that along x",
         "rts/outlines/areas_loops.py",
-        "terms[s, k, i, r, 1] -= rate * dx",
-        "terms[s, k, i, r, 1] += rate * dx",
+        "terms[s, k, i, r, 1] -= rate * way[0]",
+        "terms[s, k, i, r, 1] += rate * way[0]",
         "stencil edges edges_bodies",
     ),
     Defect(
