@@ -6,6 +6,7 @@ scikit-image, the vertices computed again from the values at the ends of their e
 drawn as a mesh.
 *Band*: at how many points a function is evaluated, and the time of evaluations and triangles, in NumPy.
 *Outlines*: derivatives of silhouettes against closed forms, and against differences of hard images.
+*Network*: a small network as an `Sdf` and as an isosurface: how often it is called, at how many points, and the time.
 *Stability*: norms of gradients while a surface passes through ties of lattice values. Contenders take turns:
 
     python -m benchmarks.implicit_surfaces -o out/implicit
@@ -171,6 +172,49 @@ def band(counts: tuple[int, ...]) -> tuple[str, dict]:
         results[f"{name}, slope"] = slope
         rows.append([name, "slope", f"{slope:.2f}", "", "", "", ""])
     return table(["", "lattice", "evaluations", "of all", "triangles", "s", "MiB"], rows), results
+
+
+# -------------------------------------------------------------------------------------------------- network
+
+
+def network(sides: tuple[int, ...], counts: tuple[int, ...], rounds: int) -> tuple[str, dict]:
+    """A silhouette of a network and its gradient in all weights, with torch: calls, points, milliseconds."""
+    torch.manual_seed(0)
+    smooth, width = torch.nn.Softplus(beta=20), 64
+    layers = [torch.nn.Linear(3, width), smooth, torch.nn.Linear(width, width), smooth, torch.nn.Linear(width, 1)]
+    net = torch.nn.Sequential(*layers)
+    optimizer = torch.optim.Adam(net.parameters(), 1e-3)
+    for _ in range(400):
+        points = 0.6 * torch.randn(512, 3)
+        loss = ((net(points)[:, 0] - points.norm(dim=1) + 0.7) ** 2).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    weights, asked = dict(net.named_parameters()), []
+
+    def field(theta: Any, points: Any) -> Any:
+        asked.append(len(points))
+        return torch.func.functional_call(net, theta, (points,))[:, 0]
+
+    surfaces = {"Sdf": rts.Sdf(field, radius=1.2)}
+    bounds = ((-1.2,) * 3, (1.2,) * 3)
+    for count in counts:
+        surfaces[f"Isosurface, {count}³"] = rts.Isosurface(bounds, f=field, shape=(count,) * 3)
+        surfaces[f"Isosurface, {count}³, band"] = rts.Isosurface(bounds, f=field, shape=(count,) * 3, band=NarrowBand())
+    rows, results = [], {}
+    for side in sides:
+
+        def step(surface: Any, side: int = side) -> None:
+            image = rts.render(rts.Part(surface, weights, "silhouette"), camera(EYE), (side, side))
+            torch.autograd.grad(image[..., 3].sum(), tuple(weights.values()), allow_unused=True)
+
+        times = in_turn({name: lambda s=surface, step=step: step(s) for name, surface in surfaces.items()}, rounds)
+        for name, surface in surfaces.items():
+            asked.clear()
+            step(surface)
+            results[f"{side}², {name}"] = times[name] | {"calls": len(asked), "points": sum(asked)}
+            rows.append([f"{side}²", name, f"{len(asked):,}", f"{sum(asked):,}", f"{times[name]['cpu']:.0f}"])
+    return table(["network", "surface", "calls", "points", "CPU ms"], rows), results
 
 
 # ------------------------------------------------------------------------------------------------- outlines
@@ -379,7 +423,7 @@ def _ball(x: float, y: float, z: float, radius: float) -> Callable[[Any, Any], A
 
 
 def main() -> None:
-    sections = ("speed", "band", "outlines", "stability", "mixed")
+    sections = ("speed", "band", "network", "outlines", "stability", "mixed")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/implicit"))
     parser.add_argument("--only", nargs="+", choices=sections, default=sections)
@@ -389,6 +433,7 @@ def main() -> None:
     runs: dict[str, Callable[[], tuple[str, dict]]] = {
         "speed": lambda: speed(2 if args.quick else 7),
         "band": lambda: band((65, 129) if args.quick else (65, 129, 257, 513)),
+        "network": lambda: network((64, 256), (48,) if args.quick else (48, 128), 2 if args.quick else 7),
         "outlines": lambda: outlines((33,) if args.quick else (33, 65, 128), 256, 2 if args.quick else 6),
         "stability": lambda: stability(12 if args.quick else 120, args.output),
         "mixed": lambda: mixed(args.output, 128 if args.quick else 400),
