@@ -128,7 +128,7 @@ def _is_own(entry: EntryPoint) -> bool:
 
 
 def load_own(group: str, name: str) -> Any:
-    """What the library's own distribution registers under a name in a group that holds no plugins.
+    """The object that the library's own distribution registers under a name in a group that holds no plugins.
 
     Args:
         group: such as "rts.testing".

@@ -1,1 +1,1 @@
-"""What a render warns of: images in which nothing is seen, entries that nothing reads, parts wound inside out."""
+"""Warnings of a render: images in which nothing is seen, entries that nothing reads, parts wound inside out."""

@@ -84,7 +84,7 @@ def _is_single(x: Array, context: Context) -> bool:
 
 @np.errstate(all="ignore")  # What is not finite is refused later.
 def _coarsest(surface: TriangleSurface, known: Any, single: Sequence[bool], size: tuple[int, int]) -> str | None:
-    """What is rounded too much for most corners in view, a text with {} for the part's number; None if nothing is.
+    """A warning where most corners in view are rounded too much, with {} for the part's number; None if they are not.
 
     Args:
         surface: the surface.

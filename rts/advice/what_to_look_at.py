@@ -1,4 +1,4 @@
-"""What advice looks at: each surface once, and values that are known."""
+"""The parts of a scene that advice looks at: each surface once, and values that are known."""
 
 from __future__ import annotations
 

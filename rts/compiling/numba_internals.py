@@ -53,7 +53,7 @@ def kept(function: Callable, options: dict[str, Any]) -> Any:
 
 
 def _uninterrupted(compile_for: Callable, module: str) -> Callable:
-    """What numba calls where a loop is not compiled for the types of some arguments: in a thread of its own.
+    """The function by which numba compiles a loop for the types of some arguments: in a thread of its own.
 
     It stays in the thread that holds the compiler's lock, for which another would wait; and while the loop's module is
     being imported, which to load a loop imports: the other thread would wait for that, too.
@@ -156,7 +156,7 @@ class _Files:
         self._files, self._folder = files, folder
 
     def load(self, key: Any) -> Any:
-        """What is kept under a key; None if there is nothing, or the process has left the folder."""
+        """The value kept under a key; None if there is nothing, or the process has left the folder."""
         with alone(self._folder, writes=False) as locked:
             return self._files.load(key) if locked else None
 

@@ -1,4 +1,4 @@
-"""What `import rts` sets in the process: how threads of torch wait, and how much freed memory is kept."""
+"""Settings of the process that `import rts` makes: how threads of torch wait, and how much freed memory is kept."""
 
 from __future__ import annotations
 

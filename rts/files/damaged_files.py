@@ -14,7 +14,7 @@ from rts import errors
 from rts.errors import FileWarning, InputError
 
 Fail = Callable[[str], InputError]
-"""What is wrong with a file → the error."""
+"""A fault of a file, in words → the error."""
 COUNT = re.compile(r"\+?[0-9]+")
 """A count in a header. Python's own rules take digits of any script."""
 _PLAIN = b"\t" + bytes(range(32, 127))

@@ -22,7 +22,7 @@ ATTRIBUTES = {
     "COLOR_0": ("VEC3 VEC4", "f4 u1 u2 u1/ u2/", ""),
     "indices": ("SCALAR", "u1 u2 u4", ""),
 }
-"""What is read of primitives: types of rows; types of numbers; and those that KHR_mesh_quantization adds.
+"""Accessors that primitives may have: types of rows; types of numbers; and those that KHR_mesh_quantization adds.
 
 Integers with "/" are `normalized`: they stand for fractions of their largest value."""
 TABLES = {

@@ -1,4 +1,4 @@
-"""What moves in GLB and glTF files: nodes, skins, and the joints and morph targets of primitives."""
+"""Moving things in GLB and glTF files: nodes, skins, and the joints and morph targets of primitives."""
 
 from __future__ import annotations
 

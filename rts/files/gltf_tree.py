@@ -36,7 +36,7 @@ DECODERS = {
     "EXT_meshopt_compression": f"{_COPY}, or by gltfpack without its option -c",
     "KHR_meshopt_compression": "export it again without compression, such as by gltfpack without its option -c",
 }
-"""What to do about an extension that is not read."""
+"""Advice about an extension that is not read."""
 LISTS = frozenset(
     "accessors animations buffers bufferViews cameras images materials meshes nodes samplers scenes skins "
     "textures".split()

@@ -39,7 +39,7 @@ class Wound(NamedTuple):
 
 @dataclass
 class Tally:
-    """What was changed in the faces of a file.
+    """Changes that were made to the faces of a file.
 
     Attributes:
         faces: how many faces were looked at.

@@ -20,7 +20,7 @@ WORK = 400
 
 
 class Picture(NamedTuple):
-    """What covers points; see `coverage`, whose arguments these are.
+    """The picture that covers points; see `coverage`, whose arguments these are.
 
     Attributes:
         samples: (M, 3).

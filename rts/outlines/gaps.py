@@ -28,7 +28,7 @@ class Hits(NamedTuple):
     depth: np.ndarray
 
     def at(self, index: np.ndarray) -> Hits:
-        """What is seen at the points with some indices."""
+        """Hits at the points with some indices."""
         return Hits(*(x[..., index] for x in self))
 
     def of_layer(self, layer: np.ndarray) -> Hits:
@@ -37,7 +37,7 @@ class Hits(NamedTuple):
 
     @classmethod
     def of(cls, several: Sequence[Hits]) -> Hits:
-        """What is seen at several sets of points, one after the other."""
+        """Hits at several sets of points, one after the other."""
         return cls(*(np.concatenate(x, axis=-1) for x in zip(*several, strict=True)))
 
 

@@ -315,7 +315,7 @@ def _halves(found: _Intervals, in_middle: Hits, oracle: Oracle) -> tuple[_Interv
 
 
 class _Change(NamedTuple):
-    """What changes in fine intervals.
+    """Changes of surfaces in fine intervals.
 
     Attributes:
         sides: the layers (K, B) before and behind.

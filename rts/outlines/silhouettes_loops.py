@@ -164,7 +164,7 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
 
 @loop
 def edges(first, last, kind, parts, triangles, points, mesh, slope, depth, tangent):
-    """What the triangles of some parts tell of crossings.
+    """Fill in depths, slopes and tangents of crossings, as the triangles of some parts have them.
 
     Args:
         first: the first crossing.

@@ -1,4 +1,4 @@
-"""What samplers build for the parts of a scene, and the inputs of triangles, on the host."""
+"""Structures that samplers build for the parts of a scene, and the inputs of triangles, on the host."""
 
 from __future__ import annotations
 

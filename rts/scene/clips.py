@@ -8,7 +8,7 @@ import numpy as np
 
 INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""What a channel moves → how many numbers it has; morph targets' "weights" have one a target."""
+"""The path of a channel → how many numbers it has; morph targets' "weights" have one a target."""
 ALIKE = 0.9995
 """Cosine between quaternions from which on they are interpolated as vectors, since the arc's sine is nearly 0."""
 

@@ -169,7 +169,7 @@ def push(first, last, border, side, colors, matrix, t_positions, t_colors, out):
 
 @compiled(inline="always")
 def _rate(motion_weight, e, t_positions, n):
-    """What an entry of motions weighs, along a tangent of positions (N, 3)."""
+    """The weight of an entry of motions along a tangent of positions (N, 3)."""
     x, y, z = t_positions[n, 0], t_positions[n, 1], t_positions[n, 2]
     return motion_weight[e, 0] * x + motion_weight[e, 1] * y + motion_weight[e, 2] * z
 

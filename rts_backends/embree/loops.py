@@ -190,7 +190,7 @@ def keep_nearest_address() -> int:
 
 
 class Target(NamedTuple):
-    """What rays are cast at.
+    """Triangles that rays are cast at, and Embree's scene of them.
 
     Attributes:
         intersect: address of rtcIntersect1.

@@ -29,7 +29,7 @@ _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, tor
 
 
 _NUMPYS = _REAL - {torch.float16, torch.bfloat16}
-"""Those of these dtypes that tensors keep as NumPy arrays."""
+"""Dtypes of these that tensors keep as NumPy arrays."""
 
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""

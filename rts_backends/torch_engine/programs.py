@@ -32,7 +32,7 @@ class Programs:
         self._programs: list[_Program] = []
 
     def __call__(self, *args: Tree) -> Tree:
-        """What the function returns, by its program for such arguments."""
+        """The result of the function, by its program for such arguments."""
         args = map_leaves(lambda x: x, args)  # Mappings of any class as dicts, which torch's trees know.
         found, structure = _pytree.tree_flatten(args)
         like = exemplar(args)

@@ -385,7 +385,7 @@ def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Ite
 
 
 def _held_by_function(function: FunctionType) -> list[Any]:
-    """What a function of Python holds in its defaults, its attributes and its closure."""
+    """Objects that a function of Python holds in its defaults, its attributes and its closure."""
     inside: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
     for cell in function.__closure__ or ():
         with contextlib.suppress(ValueError):  # A variable that is not assigned yet.
