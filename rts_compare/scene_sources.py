@@ -70,7 +70,7 @@ def scene_of(
     elif isinstance(scene, (str, Path)):
         found = _named(str(scene), parameters, directions, surface, size or SIZE)
     else:
-        raise InputError(f"scene is {quoted(scene)}; expected a name, the path of a model, or a function")
+        raise InputError(f"scene is {quoted(scene)}; expected a name, a model's path, or lambda: (parts, camera)")
     if size is not None:
         found = replace(found, size=size)
     if not found.directions:

@@ -62,17 +62,20 @@ class Evaluator(Plugin):
 class Surface(Evaluator):
     """The topology of a surface, such as the triangles of a mesh; immutable. Its numbers, such as vertices, come as θ.
 
-    Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
+    Subclass `TriangleSurface`, `RaySurface`, or both.
 
     Attributes:
         sample_widths: (I, P), the number of integers and reals of a sample, after `refine`. Every surface sets it.
         centered: whether samples lie on the rays through cells' centres. If not, splatters receive points of the rays.
         param_step: step in each of the two `params` of a sample, for the finite differences of position and uv that
             choose the level of mipmaps. Set a larger step where position and uv are linear in `params`.
+        concurrent: whether several threads may call its methods at once. False for surfaces of a function that a user
+            gives: a network may not bear it, such as one by `torch.func.functional_call`, which exchanges its weights.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
+    concurrent: bool = True
     param_step: float = 2**-8
 
     def check(self, theta: Mapping[str, Tree]) -> None:

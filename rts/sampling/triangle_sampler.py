@@ -196,7 +196,7 @@ class TriangleSampler(Sampler):
             samples = search.moved() if moves else search.in_place(pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
-        call = HostCall(part, surface, camera, bounds, entry, self.draws_at_once)
+        call = HostCall(part, surface, camera, bounds, entry, self.draws_at_once and surface.concurrent)
         samples, more = call.samples(find, beside, tables, [] if points is None else [points[None, ...]])
         return samples.replace(**more, at_points=points is not None)
 

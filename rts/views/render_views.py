@@ -253,4 +253,5 @@ def _concurrent(scene: Scene) -> bool:
     engine, like = scene.context
     # On devices work is queued by thread.
     on_host = like is None or engine.on_host(like)
-    return on_host and engine.concurrent() and all(sampler.concurrent for sampler in scene.samplers)
+    callees = *scene.samplers, *(part.surface for part in scene.parts)
+    return on_host and engine.concurrent() and all(callee.concurrent for callee in callees)

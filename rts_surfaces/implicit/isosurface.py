@@ -137,7 +137,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             None if lipschitz is None else known_number("lipschitz", check_positive("lipschitz", lipschitz))
         )
         self._usual: dict[tuple, float] = {}
-        self.sample_widths = (6, 16)
+        self.sample_widths, self.concurrent = (6, 16), f is None
         if f is not None:
             if shape is None:
                 raise InputError("shape is None; expected (X, Y, Z), how finely to look at f")

@@ -47,6 +47,7 @@ class Sdf(Implicit, RaySurface):
     """
 
     sample_widths = (0, 7)
+    concurrent = False
 
     def __init__(
         self,

@@ -1,6 +1,7 @@
 """Several views of a scene: what a loop gives, image by image and derivative by derivative; and what misuse is told."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -163,6 +164,26 @@ def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypa
     with pytest.warns(EmptyImageWarning, match="view 1"):
         more = rts.render_views(scene(), [CAMERAS[0], away, far, *CAMERAS[1:]], SIZE)
     np.testing.assert_allclose(more[[0, 3, 4]], found[0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_functions_of_users_are_called_by_one_thread_at_a_time(target, monkeypatch):
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    inside, most = set(), 0
+
+    def ball(theta, points):
+        nonlocal most
+        inside.add(threading.get_ident())
+        most = max(most, len(inside))
+        time.sleep(0.01)
+        distance = (points**2).sum(1) ** 0.5 - theta["radius"]
+        inside.discard(threading.get_ident())
+        return distance
+
+    theta = arrays(target, {"radius": np.full((), 0.8)})
+    surface = rts.Isosurface(((-1, -1, -1), (1, 1, 1)), f=ball, shape=(9, 9, 9))
+    rts.render_views(rts.Part(surface, theta, "silhouette"), CAMERAS, SIZE)
+    assert most == 1
 
 
 def test_a_prepared_scene_and_samplers_that_take_views_in_turn():
