@@ -20,7 +20,7 @@ def _point(place, x, y, along):
 
 @compiled(inline="always")
 def _add_term(terms, s, k, i, share, rates, p, t, way):
-    """Add a straight piece, by `way` (x, y), at t on piece p of a ray, to the term of a segment's cell k, for jump i."""
+    """Add a straight piece, `way` (x, y) at t on piece p of a ray, to the term of a segment's cell k, for jump i."""
     for r in range(4):
         rate = share * ((1 - t) * rates[p, 0, r] + t * rates[p, 1, r])
         terms[s, k, i, r, 0] += rate * way[1]
