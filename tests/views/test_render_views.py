@@ -166,7 +166,7 @@ def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypa
     np.testing.assert_allclose(more[[0, 3, 4]], found[0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("target", TORCH)
 def test_functions_of_users_are_called_by_one_thread_at_a_time(target, monkeypatch):
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     inside, most = set(), 0
