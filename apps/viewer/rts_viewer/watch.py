@@ -53,7 +53,7 @@ class Watch:
     def __init__(self, port: int = 8080, host: str = "127.0.0.1"):
         self._page = Page(port, host, "rts")
         self.url = self._page.url
-        self._changed, self._lock = threading.Condition(), threading.Lock()
+        self._changed, self._lock, self._labels = threading.Condition(), threading.Lock(), threading.Lock()
         self._going, self._closing = threading.Event(), threading.Event()
         self._add_controls()
         self._restart()
@@ -162,7 +162,8 @@ class Watch:
 
     def close(self) -> None:
         """End the page."""
-        self._closing.set()
+        with self._labels:  # No button is in the middle of a change.
+            self._closing.set()
         self._going.set()
         with self._changed:
             self._changed.notify()
@@ -188,18 +189,21 @@ class Watch:
 
     def _label(self) -> None:
         """Say on the buttons what they do, and have the page brought up to date, unless it is closed."""
-        if self._closing.is_set():
-            return
-        self._pause_button.label = "go on" if self.paused else "pause"
-        self._pause_button.disabled = self._over or self._stopped
-        self._stop_button.label = "close" if self._over else "stop"
+        with self._labels:
+            if self._closing.is_set():
+                return
+            self._pause_button.label = "go on" if self.paused else "pause"
+            self._pause_button.disabled = self._over or self._stopped
+            self._stop_button.label = "close" if self._over else "stop"
+            if self._chosen is not None:
+                self._follow.value = False
         with self._changed:
             self._dirty = True
             self._changed.notify()
 
     def _slid(self, event: Any) -> None:
         if event.client is not None:  # Else the program moved it.
-            self._chosen, self._follow.value = int(self._slider.value), False
+            self._chosen = int(self._slider.value)
             self._label()
 
     def _pressed_stop(self, _: Any) -> None:

@@ -245,6 +245,29 @@ def test_a_fit_may_be_stopped_after_the_page_is_closed():
     assert watch.step(0, 1.0, vertices, faces) is True
 
 
+def test_buttons_are_not_changed_while_the_page_closes(monkeypatch):
+    failures, changing, gone = [], threading.Event(), threading.Event()
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+
+    class Slow:
+        """A button whose change takes until the page has closed, if that does not wait for it."""
+
+        def __setattr__(self, name, value):
+            changing.set()
+            if watch._closing.wait(0.5):
+                gone.wait(30)
+
+    with watching() as watch:
+        watch.begin()
+        watch._pause_button = Slow()
+        press = threading.Thread(target=watch.end)
+        press.start()
+        assert changing.wait(30)
+    gone.set()
+    press.join(30)
+    assert not failures, failures[0].exc_value
+
+
 def test_pictures_that_are_read_while_the_page_closes_are_left_out(monkeypatch):
     failures, reading, gone = [], threading.Event(), threading.Event()
     monkeypatch.setattr(threading, "excepthook", failures.append)
