@@ -153,15 +153,15 @@ LOOPS = [
     Defect(
         "folds are no silhouettes",
         "rts/outlines/silhouettes_loops.py",
-        "if s >= 0 and (sides[s] * side > 0 or",
-        "if s >= 0 and (sides[s] * side != 0 or",
+        "if s >= 0 and (sides[s] * sides[t] > 0 or",
+        "if s >= 0 and (sides[s] * sides[t] != 0 or",
         "seen_mesh edges",
     ),
     Defect(
         "triangles count as four times smaller than they are",
         "rts/outlines/silhouettes_loops.py",
-        "min(wide + np.float32(1.52)",
-        "min(wide / 4 + np.float32(1.52)",
+        "wide = max(x1 - x0, y1 - y0) + more",
+        "wide = max(x1 - x0, y1 - y0) / 4 + more",
         "seen_mesh edges_soups",
     ),
     Defect(

@@ -33,7 +33,11 @@ class SeenMesh(NamedTuple):
         keep: (T,) int8, the sign of the determinants on screen of triangles that are kept; 0 for both.
         seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
         sides: (T + 1,) int8, which side of triangles is seen, and 0; see `silhouettes_loops.turns`.
-        cells: (T,) int32, the (flat) cells of the upper left corners of their boxes; see there.
+        on_lines: (T,) int32, for each block of triangles, from its first place on, those that may meet a line of
+            centres, in order, but for those that are seen edge-on or not kept; any numbers at its other places.
+        lines: (T,) int8, at these places the lines that they may meet: 1 for those along x, 2 along y, 3 for both.
+        cells: (T,) int32, at these places the (flat) cells of the upper left corners of their boxes.
+        counts: (blocks,) int32, how many each block has; see `silhouettes_loops.BLOCK`.
     """
 
     first: int
@@ -46,7 +50,10 @@ class SeenMesh(NamedTuple):
     keep: np.ndarray
     seen: np.ndarray
     sides: np.ndarray
+    on_lines: np.ndarray
+    lines: np.ndarray
     cells: np.ndarray
+    counts: np.ndarray
 
     @classmethod
     def of(
@@ -88,9 +95,11 @@ class SeenMesh(NamedTuple):
         adjacent = [_adjacent(table) for table in tables]
         adjacent = adjacent[0] if len(adjacent) == 1 else in_one(adjacent, starts[:-1].tolist())
         keep = np.full(len(faces), camera.kept_sign(cull), np.int8) if keep is None else keep
-        cells, clip = np.empty(len(faces), np.int32), near_and_far(camera)
-        mesh = cls(first, starts, vertices, faces, adjacent, rows, clip, keep, seen, sides, cells)
-        parallel(silhouettes_loops.turns, len(faces), mesh, *size, work=5 * len(faces))
+        count, blocks = len(faces), -(-len(faces) // silhouettes_loops.BLOCK)
+        on_lines, lines, cells = np.empty(count, np.int32), np.empty(count, np.int8), np.empty(count, np.int32)
+        image = rows, near_and_far(camera), keep, seen, sides, on_lines, lines, cells, np.empty(blocks, np.int32)
+        mesh = cls(first, starts, vertices, faces, adjacent, *image)
+        parallel(silhouettes_loops.turns, blocks, mesh, *size, work=5 * count)
         return mesh
 
     def mark_silhouettes(self, hits: Hits, width: np.ndarray, met: np.ndarray) -> None:
@@ -98,8 +107,8 @@ class SeenMesh(NamedTuple):
 
         `hits` (H, W), read-only, are seen at centres; for `width` see `Oracle`.
         """
-        count, mark = len(self.faces), silhouettes_loops.mark_silhouettes
-        parallel(mark, count, self, hits.part, hits.depth, width, met, work=10 * count)
+        arguments = self, hits.part, hits.depth, width, met
+        parallel(silhouettes_loops.mark_silhouettes, len(self.counts), *arguments, work=5 * len(self.faces))
 
     def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
@@ -111,16 +120,16 @@ class SeenMesh(NamedTuple):
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
-        most, count = np.empty(len(self.faces), np.int32), len(self.faces)
-        parallel(spans_loops.most_spans, count, self, gaps, most, work=10 * count)
-        (triangles,) = most.nonzero()
-        most = most[triangles]
-        ends = most.cumsum()
-        begins, total = ends - most, int(ends[-1]) if len(ends) else 0
+        blocks, count = len(self.counts), len(self.faces)
+        triangles, most, counts = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(blocks, np.int64)
+        parallel(spans_loops.most_spans, blocks, self, gaps, triangles, most, counts, work=5 * count)
+        begins = np.empty(count + 1, np.int64)
+        count = spans_loops.in_turn(counts, triangles, most, begins)
+        total = int(begins[count])
         names, spans = np.empty((total, 3), np.int32), np.empty((total, 9 if seams else 6))
         names[:, 0] = -1
         arguments = triangles, begins, self, gaps, names, spans
-        parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
+        parallel(spans_loops.spans_of, count, *arguments, work=60 * len(names))
         part = self.starts[1:-1].searchsorted(names[:, 1], "right") + self.first
         return names, spans, part.astype(np.int32)
 

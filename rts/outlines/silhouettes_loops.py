@@ -16,37 +16,79 @@ n − 0.52 cells wide and high: where they meet a gap, one of its two cells is a
 corner of their box."""
 
 
+BLOCK = 256
+"""Triangles of a block, of which loops keep few numbers; the last block may have fewer."""
+
+
 @loop
 def turns(first, last, mesh, height, width):
     """Fill the `sides` of a `SeenMesh`: which side of a triangle is seen, by the sign of its determinant.
 
-    They are multiplied by the triangle's size; see `ANY_SIZE`. And fill the `cells` of triangles, beyond the border of
-    the image the nearest one; any number for those that are seen in part.
+    They are multiplied by the triangle's size; see `ANY_SIZE`. And fill `on_lines`, with its `counts`, `lines` and
+    `cells`: the cells of triangles, beyond the border of the image the nearest one, and any for those that are seen in
+    part.
 
     Args:
-        first: the first triangle.
-        last: the triangle after the last.
+        first: the first block of triangles.
+        last: the block after the last.
         mesh: the triangles.
         height: of the image, in cells.
         width: likewise.
     """
-    rows, vertices, faces, seen, sides = mesh.rows, mesh.vertices, mesh.faces, mesh.seen, mesh.sides
-    cells, right, bottom = mesh.cells, np.float32(width - 1), np.float32(height - 1)
-    corners = np.empty((3, 4))
-    for t in range(first, last):
-        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
-        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
+    faces, seen, corners = mesh.faces, mesh.seen, np.empty((3, 4))
+    x, y, own = np.empty((3, BLOCK), np.float32), np.empty((3, BLOCK), np.float32), np.empty((5, BLOCK), np.int32)
+    sizes, lines, cells, listed, order = own[0], own[1], own[2], own[3], own[4]
+    for block in range(first, last):
+        begin, end = block * BLOCK, min((block + 1) * BLOCK, len(faces))
+        block_faces, sides, keep = faces[begin:end], mesh.sides[begin:end], mesh.keep[begin:end]
+        on_lines, listed_lines, listed_cells = mesh.on_lines[begin:end], mesh.lines[begin:end], mesh.cells[begin:end]
+        for n in range(end - begin):
+            a, b, c = block_faces[n, 0], block_faces[n, 1], block_faces[n, 2]
+            x[0, n], x[1, n], x[2, n] = seen[a, 0], seen[b, 0], seen[c, 0]
+            y[0, n], y[1, n], y[2, n] = seen[a, 1], seen[b, 1], seen[c, 1]
+        if _look(x, y, height, width, sizes, sides, cells, lines):
+            for n in range(end - begin):
+                if sides[n] == 0:
+                    sides[n] = sizes[n] * int(corners_of(begin + n, mesh.rows, mesh.vertices, faces, corners))
+        for n in range(end - begin):
+            listed[n] = (lines[n] != 0) & (sides[n] != 0) & (sides[n] * keep[n] >= 0)
+        count = 0
+        for n in range(end - begin):  # Without branches: no processor could tell which triangles are listed.
+            order[count] = n
+            count += listed[n]
+        for n in range(count):
+            on_lines[n], listed_lines[n], listed_cells[n] = begin + order[n], lines[order[n]], cells[order[n]]
+        mesh.counts[block] = count
+
+
+@compiled
+def _look(x, y, height, width, sizes, sides, cells, lines):
+    """Fill in sizes, sides, cells and lines of triangles with corners `x`, `y`; returns whether any side is 0.
+
+    Such triangles are seen edge-on, or in part, and are to be looked at again. Without branches, for a loop that takes
+    several triangles at once.
+    """
+    zero, right, bottom, again = np.float32(0), np.float32(width - 1), np.float32(height - 1), False
+    more, largest, one = np.float32(1.52), np.float32(ANY_SIZE), np.float32(1)
+    before, after = np.float32(0.51), np.float32(0.49)  # Half a cell, and more than `TOUCH` and rounding.
+    for n in range(len(sides)):
+        ax, bx, cx, ay, by, cy = x[0, n], x[1, n], x[2, n], y[0, n], y[1, n], y[2, n]
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         # Not by the least and the largest of the corners: these leave out those behind the camera, which are NaN.
-        whole = not np.isnan(area)
-        if area == 0 or not whole:
-            area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        x, y = min(seen[a, 0], seen[b, 0], seen[c, 0]), min(seen[a, 1], seen[b, 1], seen[c, 1])
-        wide = max(max(seen[a, 0], seen[b, 0], seen[c, 0]) - x, max(seen[a, 1], seen[b, 1], seen[c, 1]) - y)
-        size = int(min(wide + np.float32(1.52), np.float32(ANY_SIZE))) if whole else ANY_SIZE
-        sides[t] = size * (int(area > 0) - int(area < 0))
-        x, y = min(max(x, np.float32(0)), right), min(max(y, np.float32(0)), bottom)
-        cells[t] = int(y) * width + int(x) if whole else 0
+        whole = area == area
+        x0, x1, y0, y1 = min(ax, bx, cx), max(ax, bx, cx), min(ay, by, cy), max(ay, by, cy)
+        wide = max(x1 - x0, y1 - y0) + more
+        size = np.int32(min(wide, largest) if whole else largest)
+        sizes[n], sides[n] = size, size * (np.int32(area > 0) - np.int32(area < 0))
+        column, row = np.int32(min(max(x0, zero), right)), np.int32(min(max(y0, zero), bottom))
+        cells[n] = row * np.int32(width) + column if whole else 0
+        # Farther out there are no lines of centres, and positions are rounded more.
+        x0, x1, y0, y1 = max(x0, -one), min(x1, right + one), max(y0, -one), min(y1, bottom + one)
+        on_row = np.ceil(y0 - before) <= np.floor(y1 - after)
+        on_column = np.ceil(x0 - before) <= np.floor(x1 - after)
+        lines[n] = np.int32(on_row) + 2 * np.int32(on_column) if whole else 3
+        again |= sides[n] == 0
+    return again
 
 
 @loop
@@ -54,37 +96,46 @@ def mark_silhouettes(first, last, mesh, part, depth, width, gaps):
     """Mark, in `gaps` (2, H, W), those that silhouettes meet: 2, or 1 where both centres show something nearer.
 
     Args:
-        first: the first triangle.
-        last: the triangle after the last.
+        first: the first block of triangles.
+        last: the block after the last.
         mesh: the triangles, a `SeenMesh`.
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         gaps: (2, H, W) uint8.
     """
+    adjacent, sides = mesh.adjacent, mesh.sides
+    ends, deep, folds = np.empty((2, 2)), np.empty(2), np.empty(BLOCK, np.int32)
+    for block in range(first, last):
+        count, on_lines = 0, mesh.on_lines[block * BLOCK :]
+        for n in range(mesh.counts[block]):
+            t = on_lines[n]
+            side = sides[t]
+            a, b, c = sides[adjacent[t, 0]] * side, sides[adjacent[t, 1]] * side, sides[adjacent[t, 2]] * side
+            folds[count] = t
+            # In most triangles all three neighbours go on.
+            count += min(a, b, c) <= 0
+        for n in range(count):
+            _mark_edges(folds[n], mesh, part, depth, width, gaps, ends, deep)
+
+
+@compiled(inline="always")
+def _mark_edges(t, mesh, part, depth, width, gaps, ends, deep):
+    """Mark the gaps that the edges of triangle `t` meet at which a patch ends or turns away."""
     rows, vertices, faces, near_plane, seen = mesh.rows, mesh.vertices, mesh.faces, mesh.clip[0], mesh.seen
     keep, adjacent, sides = mesh.keep, mesh.adjacent, mesh.sides
-    ends, deep = np.empty((2, 2)), np.empty(2)
-    for t in range(first, last):
-        side = sides[t]
-        if side == 0 or side * keep[t] < 0:
+    for c in range(3):
+        s = adjacent[t, c]
+        # Two kept triangles that fold have an edge in common, which is told once.
+        if s >= 0 and (sides[s] * sides[t] > 0 or (keep[t] == 0 and s < t and sides[s] != 0)):
             continue
-        # In most triangles all three neighbours go on: one branch.
-        a, b, c = sides[adjacent[t, 0]], sides[adjacent[t, 1]], sides[adjacent[t, 2]]
-        if (a * side > 0) & (b * side > 0) & (c * side > 0):
+        a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
+        if not _passes_centres(a, b, seen) or not _in_image(a, b, seen, part.shape):
             continue
-        for c in range(3):
-            s = adjacent[t, c]
-            # Two kept triangles that fold have an edge in common, which is told once.
-            if s >= 0 and (sides[s] * side > 0 or (keep[t] == 0 and s < t and sides[s] != 0)):
-                continue
-            a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
-            if not _passes_centres(a, b, seen) or not _in_image(a, b, seen, part.shape):
-                continue
-            if not _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
-                continue
-            for axis in range(2):
-                _mark(axis, ends, min(deep[0], deep[1]), part, depth, width, gaps)
+        if not _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
+            continue
+        for axis in range(2):
+            _mark(axis, ends, min(deep[0], deep[1]), part, depth, width, gaps)
 
 
 @compiled(inline="always")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.outlines.silhouettes_loops import ANY_SIZE
+from rts.outlines.silhouettes_loops import ANY_SIZE, BLOCK
 from rts.outlines.tolerances import LARGE, TOUCH
 from rts.sampling.points_loops import corners_of, edge
 
@@ -120,36 +120,65 @@ def _gaps_of(box, axis, height, width):
 
 
 @loop
-def most_spans(first, last, mesh, gaps, most):
-    """Fill `most` (T,) int32 with bounds on the numbers of spans of triangles.
+def most_spans(first, last, mesh, gaps, triangles, most, counts):
+    """List the triangles that may have spans, with bounds on their numbers.
 
     Args:
-        first: the first triangle.
-        last: the triangle after the last.
+        first: the first block of triangles.
+        last: the block after the last.
         mesh: the triangles, a `SeenMesh`.
         gaps: the gaps.
-        most: to fill.
+        triangles: (T,) int32 to fill: for each block such triangles, from the first place of the block on.
+        most: (T,) int32 to fill, at the same places: the most spans of each.
+        counts: (blocks,) int64 to fill: how many such triangles.
     """
-    faces, seen, sides, keep, cells = mesh.faces, mesh.seen, mesh.sides, mesh.keep, mesh.cells
-    by_row, by_column, marks, box = gaps.rows, gaps.columns, gaps.around.reshape(-1), np.empty(4, np.float32)
-    height, width = by_row.shape
-    for t in range(first, last):
-        most[t] = 0
-        size = abs(sides[t])
-        if size == 0 or sides[t] * keep[t] < 0:
-            continue
-        # Sizes 4 and 5 share the last of the marks.
-        axes = marks[cells[t]] >> 2 * (min(size, 4) - 1) & 3 if size < ANY_SIZE else 3
-        if axes == 0:
-            continue
-        _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, height, width, box)
-        for axis in range(2):
-            if axes & (1 + axis) == 0:
-                continue
-            begin, stop, low, high = _gaps_of(box, axis, height, width)
-            table = by_row if axis == 0 else by_column
-            for n in range(begin, stop):
-                most[t] += table[n, high] - table[n, low]
+    seen, sides, cells, lines, on_lines = mesh.seen, mesh.sides, mesh.cells, mesh.lines, mesh.on_lines
+    marks, box, near = gaps.around.reshape(-1), np.empty(4, np.float32), np.empty((2, BLOCK), np.int32)
+    height, width = gaps.rows.shape
+    for block in range(first, last):
+        count, place = 0, block * BLOCK
+        for n in range(place, place + mesh.counts[block]):  # Without branches, as in `turns`.
+            size = abs(sides[on_lines[n]])
+            # Sizes 4 and 5 share the last of the marks.
+            axes = lines[n] & (marks[cells[n]] >> 2 * (min(size, 4) - 1) | (3 if size == ANY_SIZE else 0))
+            near[0, count], near[1, count] = on_lines[n], axes
+            count += axes != 0
+        for n in range(count):
+            t = near[0, n]
+            _box(mesh.faces[t, 0], mesh.faces[t, 1], mesh.faces[t, 2], seen, height, width, box)
+            number = _most(near[1, n], box, gaps)
+            triangles[place], most[place] = t, number
+            place += number > 0
+        counts[block] = place - block * BLOCK
+
+
+@compiled(inline="always")
+def _most(axes, box, gaps):
+    """The number of gaps, along axes, on the lines that a box meets."""
+    (height, width), number = gaps.rows.shape, 0
+    for axis in range(2):
+        begin, stop, low, high = _gaps_of(box, axis, height, width)
+        for n in range(begin, stop if axes & (1 + axis) else begin):
+            # To choose between the arrays themselves would count their references.
+            ends = (
+                (gaps.rows[n, low], gaps.rows[n, high]) if axis == 0 else (gaps.columns[n, low], gaps.columns[n, high])
+            )
+            number += ends[1] - ends[0]
+    return number
+
+
+@loop
+def in_turn(counts, triangles, most, begins):
+    """Bring the `triangles` of blocks, and `most`, to the front; returns how many there are. See `most_spans`.
+
+    And fill `begins` (T + 1,) int64 with where the spans of each begin, and where those of the last end.
+    """
+    place, begins[0] = 0, 0
+    for block in range(len(counts)):
+        for n in range(block * BLOCK, block * BLOCK + counts[block]):
+            triangles[place], begins[place + 1] = triangles[n], begins[place] + most[n]
+            place += 1
+    return place
 
 
 @loop
@@ -321,21 +350,58 @@ def by_gap(gaps, count):
     return begins, order
 
 
+FEW = 8
+"""The most spans of a gap that are sorted at once."""
+
+
 @loop
 def by_start(first, last, begins, starts, order):
     """Sort the spans of each gap, from `begins` (M + 1,) on in the list `order` (N,), by where they start.
 
-    Of those that start in one place the earlier span comes first. Shell's sort: most gaps have a few spans.
+    Of those that start in one place the earlier span comes first, as it does before. Most gaps have a few spans; others
+    are divided into as many pieces as they have spans, and the spans that start in each piece are sorted.
     """
+    most = 0
     for g in range(first, last):
-        begin, stop, step = begins[g], begins[g + 1], 1
-        while 3 * step < stop - begin:
-            step = 3 * step + 1
-        while step > 0:
-            for n in range(begin + step, stop):
-                span, m = order[n], n
-                while m - step >= begin and (starts[order[m - step]], order[m - step]) > (starts[span], span):
-                    order[m] = order[m - step]
-                    m -= step
-                order[m] = span
-            step //= 3
+        most = max(most, begins[g + 1] - begins[g])
+    ends, moved = np.empty(most + 2, np.int64), np.empty(most, np.int64)
+    for g in range(first, last):
+        begin, count = begins[g], begins[g + 1] - begins[g]
+        if count <= FEW:
+            _sort(begin, begin + count, starts, order)
+            continue
+        ends[: count + 2] = 0
+        for n in range(count):
+            ends[_piece(starts[order[begin + n]], count) + 2] += 1
+        for n in range(count):
+            ends[n + 2] += ends[n + 1]
+        for n in range(count):
+            span = order[begin + n]
+            piece = _piece(starts[span], count) + 1
+            moved[ends[piece]] = span
+            ends[piece] += 1
+        order[begin : begin + count] = moved[:count]
+        for n in range(count):
+            _sort(begin + ends[n], begin + ends[n + 1], starts, order)
+
+
+@compiled(inline="always")
+def _piece(start, count):
+    """The number of the piece of a gap, of `count`, in which a span starts; those that start before it in the first."""
+    return int(min(max(start, 0.0), 1.0) * (count - 1))
+
+
+@compiled(inline="always")
+def _sort(begin, stop, starts, order):
+    """Sort a part of `order` by `starts`, then by itself: Shell's sort."""
+    step = 1
+    while 3 * step < stop - begin:
+        step = 3 * step + 1
+    while step > 0 and stop - begin > 1:
+        for n in range(begin + step, stop):
+            span, m = order[n], n
+            while m - step >= begin and (starts[order[m - step]], order[m - step]) > (starts[span], span):
+                order[m] = order[m - step]
+                m -= step
+            order[m] = span
+        step //= 3

@@ -10,7 +10,7 @@ from rts.contracts.records import Proxy
 from rts.outlines import seen_mesh, spans_loops
 from rts.outlines.gaps import Gaps, Hits
 from rts.outlines.seen_mesh import SeenMesh
-from rts.outlines.silhouettes_loops import ANY_SIZE
+from rts.outlines.silhouettes_loops import ANY_SIZE, BLOCK
 from rts.scene.camera import Camera
 
 pytestmark = pytest.mark.sampling
@@ -171,10 +171,70 @@ def test_no_triangle_that_meets_a_gap_is_passed_over_for_its_size():
     for axis, y, x in np.argwhere(np.ones((2, *SIZE), bool)[:, :-1, :-1]):
         marks = np.zeros((2, *SIZE), bool)
         marks[axis, y, x] = True
-        gaps, counts = Gaps.of(marks), np.empty((2, 500), np.int32)
-        for looked_at, count in zip((mesh, larger), counts, strict=True):
-            spans_loops.most_spans(0, 500, looked_at, gaps, count)
-        np.testing.assert_array_equal(*counts)
+        found = []
+        for looked_at in (mesh, larger):
+            triangles, most, begins = np.empty(500, np.int32), np.empty(500, np.int32), np.zeros(501, np.int64)
+            counts = np.empty(len(mesh.counts), np.int64)
+            spans_loops.most_spans(0, len(counts), looked_at, Gaps.of(marks), triangles, most, counts)
+            count = spans_loops.in_turn(counts, triangles, most, begins)
+            found.append((triangles[:count], begins[: count + 1]))
+        np.testing.assert_array_equal(found[0][0], found[1][0])
+        np.testing.assert_array_equal(found[0][1], found[1][1])
+
+
+def listed(mesh):
+    """The triangles of `on_lines`, and their `lines`."""
+    places = np.concatenate([BLOCK * i + np.arange(count) for i, count in enumerate(mesh.counts)])
+    return mesh.on_lines[places], mesh.lines[places]
+
+
+def test_all_triangles_that_meet_a_line_of_centres_are_listed_and_few_others():
+    rng = np.random.default_rng(4)
+    corners = rng.uniform(-3, 11, (900, 1, 2)) + rng.normal(size=(900, 3, 2)) * 10 ** rng.uniform(-1, 0.6, (900, 1, 1))
+    corners[:9, 0] = 1e6, -1e6  # Far outside of the image.
+    corners[9:99, 0] += 0.5 - corners[9:99, 0] % 1  # On a line, or a little beside.
+    corners[9:99, 1:] = corners[9:99, :1] - rng.uniform(0.1, 0.4, (90, 2, 2))
+    corners[700:] = corners[700:, :1]  # Seen edge-on.
+    mesh = of(corners.reshape(-1, 2), np.arange(2700).reshape(-1, 3))
+    low, high = mesh.seen.reshape(-1, 3, 2).min(1), mesh.seen.reshape(-1, 3, 2).max(1)
+    # By lines of centres of the image, from 0 to 7: those along x are at y + 1/2.
+    for slack, least in ((2e-5, True), (0.02, False)):
+        first, last = np.maximum(np.ceil(low - 0.5 - slack), 0), np.minimum(np.floor(high - 0.5 + slack), 7)
+        meets = (first <= last)[:, ::-1] & (mesh.sides[:-1] != 0)[:, None]
+        lines = np.zeros(900, int)
+        triangles, own = listed(mesh)
+        lines[triangles] = own
+        for axis in range(2):
+            given = lines >> axis & 1 == 1
+            assert (given | ~meets[:, axis]).all() if least else (~given | meets[:, axis] | outside(low, high)).all()
+    assert (np.diff(triangles) > 0).all() and 100 < len(triangles) < 600
+
+
+def outside(low, high):
+    """True for triangles that lie beyond the image, within two cells of it."""
+    return ((high < 0.6) | (low > 7.4)).any(1)
+
+
+def test_triangles_that_are_not_kept_are_not_listed():
+    vertices, faces = icosphere(2)
+    proxy = Proxy(3 * vertices.astype(np.float32), faces)
+    both, front = (SeenMesh.of(proxy, CAMERA, SIZE, cull) for cull in ("none", "back"))
+    triangles = listed(both)[0]
+    np.testing.assert_array_equal(listed(front)[0], triangles[both.sides[triangles] * front.keep[0] > 0])
+
+
+def test_spans_are_sorted_by_where_they_start():
+    rng = np.random.default_rng(5)
+    counts = np.array([0, 1, 2, 8, 9, 40, 300, 0, 300])
+    begins = np.concatenate([[0], counts.cumsum()])
+    starts = rng.uniform(-1, 2, begins[-1])
+    starts[-300:] = rng.choice([-5.0, 0.0, 0.3, 1.0], 300)  # The earlier one first.
+    starts[-600:-300] = 10.0 ** rng.uniform(-9, 0, 300)
+    names = rng.permutation(np.repeat(np.arange(9), counts))
+    own, order = spans_loops.by_gap(names.astype(np.int32), 9)
+    np.testing.assert_array_equal(own, begins)
+    spans_loops.by_start(0, 9, begins, starts, order)
+    np.testing.assert_array_equal(order, np.lexsort((np.arange(len(names)), starts, names)))
 
 
 def test_patches_join_the_centres_between_which_they_go_on():
