@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -88,7 +89,7 @@ class SeenMesh(NamedTuple):
             tables = [x.faces if x.corners is None else x.corners for x in every]
         else:  # Of one colour triangles that meet are one patch, whether they share their vertices or not.
             tables = [_welded(x.vertices, x.faces) for x in every]
-            if any(table is not x.faces for table, x in zip(tables, every, strict=True)):
+            if not all(map(operator.is_, tables, [x.faces for x in every])):
                 shifts = [0, *itertools.accumulate(len(x.vertices) for x in every)][:-1]
                 faces = read_only(tables[0] if len(tables) == 1 else in_one(tables, shifts), np.int32)
         starts = np.array([0, *itertools.accumulate(map(len, tables))], np.int32)
@@ -120,16 +121,18 @@ class SeenMesh(NamedTuple):
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
-        blocks, count = len(self.counts), len(self.faces)
-        triangles, most, counts = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(blocks, np.int64)
-        parallel(spans_loops.most_spans, blocks, self, gaps, triangles, most, counts, work=5 * count)
-        begins = np.empty(count + 1, np.int64)
-        count = spans_loops.in_turn(counts, triangles, most, begins)
-        total = int(begins[count])
+        size = len(self.counts), spans_loops.BLOCK
+        triangles, most, counts = np.empty(size, np.int32), np.empty(size, np.int32), np.empty_like(self.counts)
+        arguments = self, gaps, triangles, most, counts
+        parallel(spans_loops.most_spans, len(counts), *arguments, work=5 * len(self.faces))
+        listed = np.arange(size[1]) < counts[:, None]
+        triangles, most = triangles[listed], most[listed]
+        ends = most.cumsum()
+        begins, total = ends - most, int(ends[-1]) if len(ends) else 0
         names, spans = np.empty((total, 3), np.int32), np.empty((total, 9 if seams else 6))
         names[:, 0] = -1
         arguments = triangles, begins, self, gaps, names, spans
-        parallel(spans_loops.spans_of, count, *arguments, work=60 * len(names))
+        parallel(spans_loops.spans_of, len(triangles), *arguments, work=60 * len(names))
         part = self.starts[1:-1].searchsorted(names[:, 1], "right") + self.first
         return names, spans, part.astype(np.int32)
 

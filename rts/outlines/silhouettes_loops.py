@@ -36,8 +36,8 @@ def turns(first, last, mesh, height, width):
         width: likewise.
     """
     faces, seen, corners = mesh.faces, mesh.seen, np.empty((3, 4))
-    x, y, own = np.empty((3, BLOCK), np.float32), np.empty((3, BLOCK), np.float32), np.empty((5, BLOCK), np.int32)
-    sizes, lines, cells, listed, order = own[0], own[1], own[2], own[3], own[4]
+    x, y, own = np.empty((3, BLOCK), np.float32), np.empty((3, BLOCK), np.float32), np.empty((4, BLOCK), np.int32)
+    sizes, lines, cells, order = own[0], own[1], own[2], own[3]
     for block in range(first, last):
         begin, end = block * BLOCK, min((block + 1) * BLOCK, len(faces))
         block_faces, sides, keep = faces[begin:end], mesh.sides[begin:end], mesh.keep[begin:end]
@@ -50,12 +50,10 @@ def turns(first, last, mesh, height, width):
             for n in range(end - begin):
                 if sides[n] == 0:
                     sides[n] = sizes[n] * int(corners_of(begin + n, mesh.rows, mesh.vertices, faces, corners))
-        for n in range(end - begin):
-            listed[n] = (lines[n] != 0) & (sides[n] != 0) & (sides[n] * keep[n] >= 0)
         count = 0
         for n in range(end - begin):  # Without branches: no processor could tell which triangles are listed.
             order[count] = n
-            count += listed[n]
+            count += (lines[n] != 0) & (sides[n] != 0) & (sides[n] * keep[n] >= 0)
         for n in range(count):
             on_lines[n], listed_lines[n], listed_cells[n] = begin + order[n], lines[order[n]], cells[order[n]]
         mesh.counts[block] = count

@@ -128,16 +128,16 @@ def most_spans(first, last, mesh, gaps, triangles, most, counts):
         last: the block after the last.
         mesh: the triangles, a `SeenMesh`.
         gaps: the gaps.
-        triangles: (T,) int32 to fill: for each block such triangles, from the first place of the block on.
-        most: (T,) int32 to fill, at the same places: the most spans of each.
-        counts: (blocks,) int64 to fill: how many such triangles.
+        triangles: (blocks, BLOCK) int32 to fill: in the first places of each block such triangles.
+        most: (blocks, BLOCK) int32 to fill, at the same places: the most spans of each.
+        counts: (blocks,) int32 to fill: how many such triangles.
     """
     seen, sides, cells, lines, on_lines = mesh.seen, mesh.sides, mesh.cells, mesh.lines, mesh.on_lines
     marks, box, near = gaps.around.reshape(-1), np.empty(4, np.float32), np.empty((2, BLOCK), np.int32)
     height, width = gaps.rows.shape
     for block in range(first, last):
-        count, place = 0, block * BLOCK
-        for n in range(place, place + mesh.counts[block]):  # Without branches, as in `turns`.
+        count, listed, place = 0, block * BLOCK, 0
+        for n in range(listed, listed + mesh.counts[block]):  # Without branches, as in `turns`.
             size = abs(sides[on_lines[n]])
             # Sizes 4 and 5 share the last of the marks.
             axes = lines[n] & (marks[cells[n]] >> 2 * (min(size, 4) - 1) | (3 if size == ANY_SIZE else 0))
@@ -146,10 +146,9 @@ def most_spans(first, last, mesh, gaps, triangles, most, counts):
         for n in range(count):
             t = near[0, n]
             _box(mesh.faces[t, 0], mesh.faces[t, 1], mesh.faces[t, 2], seen, height, width, box)
-            number = _most(near[1, n], box, gaps)
-            triangles[place], most[place] = t, number
-            place += number > 0
-        counts[block] = place - block * BLOCK
+            triangles[block, place], most[block, place] = t, _most(near[1, n], box, gaps)
+            place += most[block, place] > 0
+        counts[block] = place
 
 
 @compiled(inline="always")
@@ -165,20 +164,6 @@ def _most(axes, box, gaps):
             )
             number += ends[1] - ends[0]
     return number
-
-
-@loop
-def in_turn(counts, triangles, most, begins):
-    """Bring the `triangles` of blocks, and `most`, to the front; returns how many there are. See `most_spans`.
-
-    And fill `begins` (T + 1,) int64 with where the spans of each begin, and where those of the last end.
-    """
-    place, begins[0] = 0, 0
-    for block in range(len(counts)):
-        for n in range(block * BLOCK, block * BLOCK + counts[block]):
-            triangles[place], begins[place + 1] = triangles[n], begins[place] + most[n]
-            place += 1
-    return place
 
 
 @loop
@@ -361,9 +346,7 @@ def by_start(first, last, begins, starts, order):
     Of those that start in one place the earlier span comes first, as it does before. Most gaps have a few spans; others
     are divided into as many pieces as they have spans, and the spans that start in each piece are sorted.
     """
-    most = 0
-    for g in range(first, last):
-        most = max(most, begins[g + 1] - begins[g])
+    most = (begins[first + 1 : last + 1] - begins[first:last]).max() if last > first else 0
     ends, moved = np.empty(most + 2, np.int64), np.empty(most, np.int64)
     for g in range(first, last):
         begin, count = begins[g], begins[g + 1] - begins[g]

@@ -233,7 +233,8 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
             sides = np.int8([ANY_SIZE, ANY_SIZE])
-            own = SeenMesh(0, starts, vertices, faces, none, rows, clip, both, seen, sides, np.zeros(2, np.int32))
+            listed = np.int32([0, 1]), np.int8([3, 3]), np.zeros(2, np.int32), np.int32([2])
+            own = SeenMesh(0, starts, vertices, faces, none, rows, clip, both, seen, sides, *listed)
             names, spans, _ = own.spans(Gaps.of(marks), True)
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
