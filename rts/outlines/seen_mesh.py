@@ -111,12 +111,12 @@ class SeenMesh(NamedTuple):
         arguments = self, hits.part, hits.depth, width, met
         parallel(silhouettes_loops.mark_silhouettes, len(self.counts), *arguments, work=5 * len(self.faces))
 
-    def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray) -> None:
+    def join(self, hits: Hits, met: np.ndarray, colors: bool, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
 
-        `hits` (H, W), read-only, are seen at centres; for `met` see `mark_silhouettes`.
+        `hits` (H, W), read-only, are seen at centres; for `met` see `mark_silhouettes`, for `colors` the loop `seams`.
         """
-        arguments = hits.part, hits.triangle, self, met, joined
+        arguments = hits.part, hits.triangle, self, met, colors, joined
         parallel(seen_mesh_loops.seams, len(joined[0]), *arguments, work=8 * joined[0].size)
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -137,7 +137,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, mesh, met, joined):
+def seams(first, last, part, triangle, mesh, met, colors, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose first hits are joined by a patch of triangles.
 
     Args:
@@ -147,6 +147,8 @@ def seams(first, last, part, triangle, mesh, met, joined):
         triangle: likewise, their triangles.
         mesh: the triangles of some parts, a `SeenMesh`.
         met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.mark_silhouettes`.
+        colors: whether colours differ on a part. Where they do not, a part that no silhouette meets goes on, since
+            nobody can tell whether its patches intersect.
         joined: (2, H, W) or (2, K H, W) bool to fill: along x, and along y.
     """
     (_, height, width), keep, seen, faces, adjacent = met.shape, mesh.keep, mesh.seen, mesh.faces, mesh.adjacent
@@ -160,7 +162,7 @@ def seams(first, last, part, triangle, mesh, met, joined):
             for x in range(count):
                 own, there = part[y, x], part[y + dy, x + dx]
                 same = (own >= part_range[0]) & (own < part_range[1]) & (own == there) & (met[axis, line, x] != 2)
-                one = triangle[y, x] == triangle[y + dy, x + dx]
+                one = triangle[y, x] == triangle[y + dy, x + dx] or (not colors and met[axis, line, x] == 0)
                 joined[axis, y, x] |= same & one
                 apart[x] = same & ~one
             for x in range(count):

@@ -250,6 +250,20 @@ def test_patches_join_the_centres_between_which_they_go_on():
     met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
     fronts = Hits(read_only(part), read_only(triangle), read_only(5.0 * np.ones(SIZE)))
     own.mark_silhouettes(fronts, np.array([1.0, 0.0]), met)
-    own.join(fronts, met, joined)
+    own.join(fronts, met, True, joined)
     both = [(part >= 0) & (np.roll(part, -1, axis) >= 0) for axis in (1, 0)]
     np.testing.assert_array_equal(joined, both)
+
+
+@pytest.mark.parametrize("colors", [False, True])
+def test_patches_of_a_part_that_intersect_are_told_apart_by_colours_alone(colors):
+    far = [(-60, -60), (60, -60), (1, 100)]
+    vertices = np.array([(x, y, sign * 0.1 * x) for sign in (1, -1) for x, y in far], np.float32)
+    own = SeenMesh.of(Proxy(vertices, np.array([(0, 1, 2), (3, 4, 5)], np.int32)), CAMERA, SIZE, "none")
+    right = np.tile(np.arange(8) >= 4, (8, 1))
+    fronts = Hits(*map(read_only, (np.zeros(SIZE, np.int32), np.where(right, 0, 1).astype(np.int32), np.ones(SIZE))))
+    met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
+    own.mark_silhouettes(fronts, np.array([1.0, 0.0]), met)
+    own.join(fronts, met, colors, joined)
+    assert not met.any() and joined[1, :-1].all() and not joined[0, :, 7].any()
+    np.testing.assert_array_equal(joined[0, :, :7].all(0), [True] * 3 + [not colors] + [True] * 3)
