@@ -15,6 +15,10 @@ from rts.errors import PluginError
 class Plugin(abc.ABC):  # noqa: B024
     """The common base of `Surface`, `Sampler` and the like; a plugin subclasses the base class of its kind."""
 
+    def __repr__(self) -> str:
+        """The name of the class, as errors tell it: the address of an object helps nobody."""
+        return type(self).__name__
+
 
 PROMISES: Mapping[str, tuple[str, ...]] = {
     "uniform": ("__call__",),

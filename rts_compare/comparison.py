@@ -16,6 +16,7 @@ from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
 from rts.tool_api.files import output_folder, writing
+from rts_compare.chart_style import label, time_label
 from rts_compare.compared_settings import Setting, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
@@ -59,6 +60,18 @@ class Comparison:
     modes: Mapping[str, Mapping[str, float]]
     rows: Sequence[Row]
     left_out: Sequence[str]
+
+    def __str__(self) -> str:
+        """A line for each mode and setting, the most accurate first; "*" marks the front."""
+        height, width = self.scene["size"]
+        lines = [f"{self.scene['name']}, {height} × {width}: error of the derivative, time of a render and gradient"]
+        for mode in self.modes:
+            own = sorted((row for row in self.rows if row["mode"] == mode), key=lambda row: row["error"])
+            lines += ["", mode]
+            for row in own:
+                time = "not timed" if row["ms"] is None else time_label(row["ms"]["median"])
+                lines.append(f"{'*' if row['front'] else ' '} {100 * row['error']:8.3g} %  {time:>9}  {label(row)}")
+        return "\n".join([*lines, *([""] if self.left_out else []), *self.left_out])
 
     @property
     def data(self) -> dict[str, Any]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.trees import collected
 from rts.compiling.threads import read_only
 from rts.contracts.records import ArraySpec, Stencil
 from rts.outlines import segments_loops
@@ -124,12 +124,4 @@ def fits(stencil: Stencil, most: int | None) -> bool:
         return True
     layers = 1 if stencil.stacks is None else stencil.stacks.shape[1]
     room = specs(most, stencil.joined.shape[1:], None, layers)
-    return all(x.shape[0] <= spec.shape[0] for x, spec in zip(arrays_of(stencil), room, strict=True))
-
-
-def arrays_of(stencil: Stencil) -> list[Any]:
-    """The arrays of a stencil, in the order of `specs`."""
-    return [x for x in (getattr(stencil, name) for name in FIELDS) if x is not None]
-
-
-FIELDS = tuple(field.name for field in fields(Stencil))
+    return all(x.shape[0] <= spec.shape[0] for x, spec in zip(collected(stencil), room, strict=True))

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays.engines import Context, engine_of, host_value, is_traced, namespace, stopped
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.arrays.trees import Array, Tree, collected, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Sampled, Samples, Stencil
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.outlines.found import Outlines, arrays_of, fits, specs
+from rts.outlines.found import Outlines, fits, specs
 from rts.outlines.points import Points, at_centres, has_pairs
 from rts.outlines.required import Required
 from rts.sampling.entries import inputs_of, is_batched, proxy_inputs
@@ -74,7 +74,7 @@ def with_outlines(
     # Engines that compile eager operations anew for each shape pad them.
     engine, overflow, cells = engine_of(sampled.row), sampled.overflow + np.int32(found.left_out), sampled.cells
     if engine.differentiates:
-        arrays, layers = arrays_of(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
+        arrays, layers = collected(stencil), 1 if stencil.stacks is None else stencil.stacks.shape[1]
         stencil = Stencil(*engine.call_host(lambda _: arrays, specs(0, grid.size, real, layers), sampled.row))
     cells = replace(cells, triangle=None)
     return replace(sampled, samples=samples, cells=cells, stencil=stencil, overflow=overflow)
@@ -182,7 +182,7 @@ def _found_on_host(
             if not count or (fits(stencil, most) and all(own.holds(x) for own, x in zip(room, more, strict=True))):
                 break
             count = min(count, len(found.place)) // 2
-        results = [*arrays_of(stencil), _used(found.rows, of_rows, parts), found.left_out]
+        results = [*collected(stencil), _used(found.rows, of_rows, parts), found.left_out]
         for part, samples, tables in zip(here.parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = (

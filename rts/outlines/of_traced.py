@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.engines import Context, engine_of, is_constant, is_traced, namespace, stopped
-from rts.arrays.trees import Array, leaves, map_leaves
+from rts.arrays.trees import Array, collected, leaves, map_leaves
 from rts.compiling.threads import OnAllCores
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples, Stencil
 from rts.errors import InputWarning, warn
-from rts.outlines.found import arrays_of, fits, specs
+from rts.outlines.found import fits, specs
 from rts.outlines.of_joint import AtOnce
 from rts.outlines.of_scene import most_crossings
 from rts.outlines.required import Required
@@ -207,7 +207,7 @@ class _Call:
             row = sampled.row
             if len(sizes) > 1:
                 row, stencil = moved[row], stencil.with_samples(moved.__getitem__)
-            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *arrays_of(stencil)]
+            results += [row, sampled.depth, np.asarray(sampled.overflow, np.int32), *collected(stencil)]
             found.append(results)
         return found
 

@@ -123,8 +123,7 @@ class SeenMesh(NamedTuple):
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
         size = len(self.counts), spans_loops.BLOCK
         triangles, most, counts = np.empty(size, np.int32), np.empty(size, np.int32), np.empty_like(self.counts)
-        arguments = self, gaps, triangles, most, counts
-        parallel(spans_loops.most_spans, len(counts), *arguments, work=5 * len(self.faces))
+        parallel(spans_loops.most_spans, len(counts), self, gaps, triangles, most, counts, work=5 * len(self.faces))
         listed = np.arange(size[1]) < counts[:, None]
         triangles, most = triangles[listed], most[listed]
         ends = most.cumsum()

@@ -257,6 +257,17 @@ class TestCompare:
             assert best["error"] <= 0.3
             assert comparison.best(mode, 1e-6) is None
 
+    def test_it_prints_a_line_for_each_row(self, found):
+        comparison, _ = found
+        lines = str(comparison).splitlines()
+        rows = [line for line in lines if " %  " in line]
+        assert len(rows) == len(comparison.rows) and sum(line[0] == "*" for line in rows) == sum(
+            row["front"] for row in comparison.rows
+        )
+        assert lines[0].endswith("time of a render and gradient") and set(comparison.modes) <= set(lines)
+        errors = [float(line[2:10]) for line in rows if "edges" in line]
+        assert max(errors) < 100 and len(errors) > 1
+
     def test_error_is_that_of_the_derivative(self, found, kept):
         torch = pytest.importorskip("torch")
         comparison, _ = found

@@ -120,7 +120,7 @@ def _relative(folder: Path, entry: _Entry) -> str:
     """The name of a view's picture, relative to a folder."""
     if entry.view.path is None:
         if not entry.view.name:
-            raise InputError(f"{entry.place} has neither path nor name; expected a view of a picture")
+            raise InputError(f"{entry.place} names no picture; expected rts.View(camera, image, name='0.png'), say")
         return entry.view.name
     return Path(os.path.relpath(entry.view.path.resolve(), folder.resolve())).as_posix()
 
