@@ -362,7 +362,7 @@ ARRAYS = [
         "rts/files/mtl_reader.py",
         "values[0] if of_meshlab or values[0] >= 1 else 1 - values[0]",
         "values[0]",
-        "files misread_files",
+        "files damaged_files",
     ),
     Defect(
         "a robust loss weighs by the wrong root",

@@ -51,7 +51,7 @@ def warmup(processes: int | None = None) -> float:
 
 
 def _call(name: str) -> None:
-    """Make one of the calls in a process of its own, which finds modules and kept loops where this process does."""
+    """Make one of the calls in a process of its own, with the modules and the folder of compiled loops of this one."""
     path = [p or os.getcwd() for p in sys.path if isinstance(p, str)]  # An empty entry is the working directory.
     environment = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
     if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):

@@ -1,4 +1,4 @@
-"""The base class of samplers."""
+"""The base class of samplers. Those of triangles derive from `rts.TriangleSampler`, and write `rasterize` alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The base classes of splatters."""
+"""The base classes of splatters, which turn `Splats` (see `records.py`) into an image."""
 
 from __future__ import annotations
 

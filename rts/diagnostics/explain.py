@@ -59,8 +59,8 @@ def explain(
 
     Returns:
         For each part the name of the `sampler`, the `reason`, and `remarks` on likely mistakes. With a size also the
-        number of `samples`, apron and those beside outlines included, and a remark on a shader of your own whose
-        colours step, which has no derivative.
+        number of `samples`, which includes those around the image and beside outlines, and a remark on a shader of
+        your own whose colours jump where nothing moves, such as by rounding: a jump has no derivative.
 
     Raises:
         InputError: the scene cannot be sampled.

@@ -18,11 +18,10 @@ FAR = 1e13
 
 
 def read_cameras(gltf: Gltf) -> list[tuple[str, Camera]]:
-    """The cameras of the scene that is shown, in the order of its nodes, whose scale does not count, and their names.
+    """The cameras of the scene that is shown, in the order of its nodes, and the cameras' names.
 
-    The name is the node's, else the camera's own, else "".
-
-    One without an aspect ratio takes that of the rendered size; one without a far plane has none.
+    The scale of a node does not count. A camera's name is its node's, else its own, else "". A camera without an aspect
+    ratio takes that of the rendered size; one without a far plane has none.
 
     Raises:
         InputError: a camera is invalid, or its node's transform is.

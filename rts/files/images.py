@@ -175,7 +175,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
 
 
 def _duration(kind: str, fps: float) -> int:
-    """Milliseconds of a frame, rounded as the format needs; 0 for .mp4. Rates that it cannot hold are refused."""
+    """Milliseconds of a frame, rounded as the format needs; 0 for .mp4. Refuses rates that the format cannot hold."""
     step = {".gif": 10, ".png": 1}.get(kind)
     if step is None:
         return 0

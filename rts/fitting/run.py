@@ -218,7 +218,7 @@ def require(finite: bool, what: str, start: bool) -> None:
 
 @contextlib.contextmanager
 def progress_bar(wanted: bool | None, steps: int, method: str, run: Run) -> Iterator[None]:
-    """A progress bar on standard error, if `wanted`; None for only on a terminal."""
+    """Show a progress bar on standard error meanwhile, if `wanted`; if that is None, only where it is a terminal."""
     if not shows_bar(wanted):
         yield
         return

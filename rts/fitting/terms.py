@@ -45,14 +45,14 @@ class Terms:
         self._processes = processes if self.several else None
 
     def unchecked(self, data: Tree) -> Residuals:
-        """Residuals of one term, as they were given."""
+        """The residuals of one term; `of` checks what they return, too."""
         term = self.residuals.of(data) if self.several else self.residuals
         if not callable(term):
             raise InputError(f"of of {self.residuals!r} gave {quoted(term)}; expected residuals of one term")
         return term
 
     def of(self, data: Tree) -> Callable[[Tree], Array]:
-        """Residuals of one term, whose results are checked."""
+        """The residuals of one term, as a function that refuses results of another kind."""
         return self._checked(self.unchecked(data))
 
     def first(self) -> Tree:

@@ -79,9 +79,13 @@ class Hints(NamedTuple):
 
 
 def find_crossings(layers: Hits, oracle: Oracle, hints: Hints | None = None) -> tuple[Crossings, Stacks]:
-    """The crossings between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there.
+    """The crossings between the layers that the centres of cells see, and the stacks of layers beside each crossing.
 
-    Where these centres see the same, a gap is looked at only if it has hints, and at their places first.
+    Args:
+        layers: what is seen at centres, arrays (K, H, W).
+        oracle: tells what is seen anywhere else.
+        hints: places where something may be that no centre sees. A gap whose two centres see the same is looked at only
+            if it has hints, and at their places first.
     """
     _, height, width = layers.part.shape
     axis, y, x = np.mgrid[:2, :height, :width].reshape(3, -1)

@@ -222,11 +222,11 @@ def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
 
 
 class _Room(NamedTuple):
-    """The room for samples of a part beside crossings.
+    """The capacity for samples of a part beside crossings, in a compiled program.
 
     Attributes:
         rows: the largest number of these samples.
-        tables: the numbers of rows, by name, of tables that they share.
+        tables: the capacities, by name, of tables whose rows several samples share; see `Samples.tables`.
     """
 
     rows: int

@@ -34,8 +34,8 @@ def plane_at(corners, sign, x, y):
 def neighbours(faces, order):
     """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 where none or several share it.
 
-    The other side of a triangle, with the same corners, does not count. `order` (3 T,) sorts the edges (3 t + corner)
-    by their ends.
+    A triangle with the same three corners, such as the back of a double face, is no neighbour. `order` (3 T,) sorts the
+    edges (3 t + corner) by their ends.
     """
     found = np.full((len(faces), 3), -1, np.int32)
     n = 0

@@ -14,7 +14,7 @@ from rts.errors import LayersWarning, warn
 LAYER_LIMIT = 16
 """The largest number of layers that `layers="auto"` takes."""
 TRACED_LAYERS = {True: 2, False: 4}
-"""The number of layers that it takes where values are traced, if all is opaque, or not."""
+"""The number of layers that `layers="auto"` takes in compiled programs, by whether all parts are opaque."""
 
 
 def with_all_layers(taken: Callable[[int], Sampled], opaque: bool, least: int = 1) -> Sampled:

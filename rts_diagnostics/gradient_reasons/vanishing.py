@@ -239,7 +239,7 @@ def _seen_by_blur(subject: Subject, number: Number) -> int | None:
 
 
 def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
-    """At most one finding, named "": combinations of numbers that leave the image as it is, though each changes it."""
+    """Combinations of numbers that leave the image as it is, though each number changes it: one finding, named ""."""
     numbers = [n for n in numbers if np.isfinite(n.pushed).all() and not is_quiet(n.pushed)]
     if len(numbers) < 2:
         return []

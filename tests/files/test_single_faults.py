@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-import tampered_files as tampered
+import single_faults as faults
 from helpers import arrays, quick, to_numpy
 from lines import Lines
 from posed import SIZE, binary_model, save, text_model
@@ -84,28 +84,28 @@ TREES = {"transforms.json": nerf_tree, "cameras.json": opencv_tree}
 @pytest.mark.parametrize("chosen", seeds(6, 40))
 @pytest.mark.parametrize("name", TREES)
 def test_tampered_cameras_of_json_are_read_or_refused_in_one_line(tmp_path, name, chosen):
-    folder = tmp_path / f"a{tampered.MARK}b"
+    folder = tmp_path / f"a{faults.MARK}b"
     tree = TREES[name](folder)
     path = folder / name
     path.write_text(json.dumps(tree))
     assert len(outcome(lambda: seen(path))) == 2
     for seed in chosen:
-        path.write_bytes(tampered.tampered_json(np.random.default_rng([seed, 1]), tree))
+        path.write_bytes(faults.tampered_json(np.random.default_rng([seed, 1]), tree))
         outcome(lambda: seen(path))
 
 
 @pytest.mark.parametrize("chosen", seeds(3, 15))
 def test_tampered_cameras_of_llff_are_read_or_refused_in_one_line(tmp_path, chosen):
-    folder = tmp_path / f"a{tampered.MARK}b"
+    folder = tmp_path / f"a{faults.MARK}b"
     rows = llff(folder)
     path = folder / "poses_bounds.npy"
     sound = path.read_bytes()
     for seed in chosen:
         random = np.random.default_rng([seed, 2])
-        path.write_bytes(tampered.tampered_bytes(random, sound))
+        path.write_bytes(faults.tampered_bytes(random, sound))
         outcome(lambda: seen(path))
         changed = rows.copy()
-        changed[random.integers(len(rows)), random.integers(17)] = tampered.any_of(random, [5e-324, 1e300, -1e300, 0])
+        changed[random.integers(len(rows)), random.integers(17)] = faults.any_of(random, [5e-324, 1e300, -1e300, 0])
         np.save(path, changed)
         outcome(lambda: seen(path))
 
@@ -117,7 +117,7 @@ WRITERS = {"bin": binary_model, "txt": text_model}
 @pytest.mark.parametrize("table", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("form", WRITERS)
 def test_tampered_models_of_colmap_are_read_or_refused_in_one_line(tmp_path, form, table, chosen):
-    folder = tmp_path / f"a{tampered.MARK}b"
+    folder = tmp_path / f"a{faults.MARK}b"
     listed = images(2)
     WRITERS[form](folder / "sparse", CAMERAS, listed, POINTS[:6])
     for *_, name, _ in listed:
@@ -129,7 +129,7 @@ def test_tampered_models_of_colmap_are_read_or_refused_in_one_line(tmp_path, for
         random = np.random.default_rng([seed, 3])
         binary = form == "bin"
         path.write_bytes(
-            tampered.tampered_bytes(random, sound) if binary else tampered.tampered_lines(random, sound.decode())
+            faults.tampered_bytes(random, sound) if binary else faults.tampered_lines(random, sound.decode())
         )
         outcome(lambda: seen(cameras))
 
@@ -152,13 +152,13 @@ def fit(path, kind, steps=7):
 
 def state_of(kind):
     """The function that tampers with the state of a method."""
-    return tampered.tampered_torch_state if kind.split()[1] != "lm" and "torch" in kind else tampered.tampered_archive
+    return faults.tampered_torch_state if kind.split()[1] != "lm" and "torch" in kind else faults.tampered_archive
 
 
 @pytest.mark.parametrize("chosen", seeds(1, 12))
 @pytest.mark.parametrize("kind", METHODS)
 def test_tampered_checkpoints_are_gone_on_from_or_refused_in_one_line(tmp_path, kind, chosen):
-    folder = tmp_path / f"a{tampered.MARK}b"
+    folder = tmp_path / f"a{faults.MARK}b"
     folder.mkdir()
     path = folder / "fit.npz"
     fit(path, kind)
@@ -166,7 +166,7 @@ def test_tampered_checkpoints_are_gone_on_from_or_refused_in_one_line(tmp_path, 
     whole = fit(tmp_path / "whole.npz", kind, 9)
     assert outcome(lambda: fit(path, kind, 9)).history == whole.history
     for seed in chosen:
-        path.write_bytes(tampered.tampered_checkpoint(np.random.default_rng([seed, 4]), sound, state_of(kind)))
+        path.write_bytes(faults.tampered_checkpoint(np.random.default_rng([seed, 4]), sound, state_of(kind)))
         found = outcome(lambda: fit(path, kind, 9))
         if found is not None:
             assert all(np.isfinite(x).all() for x in to_numpy(found.parameters).values()) and np.isfinite(found.loss)
