@@ -14,14 +14,14 @@ from rts import Camera, Engine, Part, RaySurface, Surface, TriangleSampler, Tria
 from rts.errors import EmptyImageWarning, InputError, RtsError
 from rts.plugin_api.arrays import constants, leaves, map_leaves
 from rts.tool_api.plugins import check_sampler, engine_named
-from rts.tool_api.scenes import APRON, check_scene
+from rts.tool_api.scenes import BORDER, check_scene
 
 SIZE = (14, 18)
 CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))
 """A view of an example, which lies about the origin, within two units of it. The view has no symmetry."""
 
 LAYERS = 2
-CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
+CAPACITY = LAYERS * (SIZE[0] + 2 * BORDER) * (SIZE[1] + 2 * BORDER)
 """A row of samples for every cell, so that all calls have the same shapes, and engines compile once."""
 
 DIFFERING, SHARE = 1e-3, 0.02

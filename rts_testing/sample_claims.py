@@ -7,7 +7,7 @@ import numpy as np
 from rts import Camera, Part
 from rts.results import Sampled
 from rts_testing.claims import claim
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 from rts_testing.scenes import GRID, SIZE
 
 REPROJECTION = 0.02
@@ -33,7 +33,7 @@ def claim_reprojected(part: Part, sampled: Sampled, camera: Camera, view: str) -
     if not len(k):
         return
     position = np.asarray(part.surface.evaluate(part.theta, samples)["position"], np.float64)
-    seen = camera.within(part.transform).with_apron(SIZE, APRON).project(position, GRID)[row[k, y, x]]
+    seen = camera.within(part.transform).with_border(SIZE, BORDER).project(position, GRID)[row[k, y, x]]
     off = np.linalg.norm(seen[:, :2] - np.stack([x + 0.5, y + 0.5], -1), axis=1)
     claim(
         off.max() <= RESIDUAL and np.mean(off > REPROJECTION) <= FEW,

@@ -15,7 +15,7 @@ from rts.tool_api.plugins import check_sampler
 from rts_testing import derivatives, scenes
 from rts_testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts_testing.claims import claim, no_error, refusal
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 from rts_testing.conformance import Conformance
 from rts_testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
 from rts_testing.expected_samples import Silhouettes, again, claim_like, differing, is_of_triangles, reference, right
@@ -89,7 +89,7 @@ class SamplerConformance(Conformance):
             sampled = scenes.find(part, camera, sampler)
             claim_empty_where_empty(sampled, view)
             image = scenes.render(part, camera, scenes.SIZE, sampler=sampler, splatter="none")
-            empty = np.asarray(sampled.row)[0, APRON:-APRON, APRON:-APRON] < 0
+            empty = np.asarray(sampled.row)[0, BORDER:-BORDER, BORDER:-BORDER] < 0
             claim((image[empty] == 0).all(), f"{view}: the image is not zero where nothing is seen")
 
     def test_samples_lie_between_the_near_and_the_far_plane(self, sampler: Any, parts: list[Part]) -> None:

@@ -12,10 +12,10 @@ from rts.results import Sampled
 from rts.tool_api.scenes import check_scene
 from rts_testing import compatibility
 from rts_testing.claims import claim
-from rts_testing.compatibility import APRON, CAPACITY, LAYERS, SIZE
+from rts_testing.compatibility import BORDER, CAPACITY, LAYERS, SIZE
 from rts_testing.derivatives import single
 
-GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
+GRID = SIZE[0] + 2 * BORDER, SIZE[1] + 2 * BORDER
 
 
 def _rounded(camera: Camera) -> Camera:

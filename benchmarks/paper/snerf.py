@@ -338,8 +338,8 @@ def drawn(
         evaluations.append(sum(shaded))
         options = SPLATTERS[scene.splatter] | {"supersample": supersample}
         found = rts.sample(part, shot.camera, shot.size, **options)
-        apron, fine = found.apron, supersample
-        row = found.row[0, apron:-apron, apron:-apron] >= 0
+        border, fine = found.border, supersample
+        row = found.row[0, border:-border, border:-border] >= 0
         pixels = row.reshape(shot.size[0], fine, shot.size[1], fine).any(axis=(1, 3))
         covered.append(int(pixels.sum()))
     numbers = scores(images, shots) | {"seconds": seconds, "evaluations": evaluations, "covered": covered}

@@ -119,13 +119,13 @@ def sampled_cards() -> tuple[Any, Any, np.ndarray]:
     return sampled, *found[0]
 
 
-def chosen_crossing(found: Any, apron: int, y: int, x: int) -> int:
+def chosen_crossing(found: Any, border: int, y: int, x: int) -> int:
     """The index of the crossing in the gap along the row from pixel (y, x)."""
-    [(index,)] = np.argwhere((found.gap == (y + apron, x + apron, 1)).all(axis=1))
+    [(index,)] = np.argwhere((found.gap == (y + border, x + border, 1)).all(axis=1))
     return int(index)
 
 
-def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
+def seen_from_the_eye(axes: Any, found: Any, border: int) -> None:
     """Centres, gaps, crossings and segments, as the library finds them."""
     bare(axes, "centres see the near card or the far one;\nbetween unlike neighbours lies a gap")
     corner = np.array([(x + SIDE / 2, SIDE / 2 - y) for x, y, _ in CARD])
@@ -133,7 +133,7 @@ def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
     for line in range(SIDE + 1):
         axes.plot((0, SIDE), (line, line), color=GRID, lw=0.6, zorder=0)
         axes.plot((line, line), (0, SIDE), color=GRID, lw=0.6, zorder=0)
-    first = found.gap[:, 1::-1] - apron + 0.5
+    first = found.gap[:, 1::-1] - border + 0.5
     way = np.stack([found.gap[:, 2], 1 - found.gap[:, 2]], axis=1)
     place = first + found.place[:, None] * way
     inside = ((first >= 0.5) & (first + way <= SIDE - 0.5)).all(axis=1)
@@ -144,7 +144,7 @@ def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
         shown = ORANGE if near.contains_point((x + 0.5, y + 0.5)) else BLUE
         axes.plot(x + 0.5, y + 0.5, "o", ms=4.5, color=shown, zorder=4)
     for square, endpoints, turn in zip(*found.segments[:2], found.segments.corner, strict=True):
-        bend = square[::-1] - apron + 0.5 + turn
+        bend = square[::-1] - border + 0.5 + turn
         path = np.stack([place[endpoints[0]], bend, place[endpoints[1]]])
         axes.plot(*path.T, color=INK, lw=1.6, zorder=3)
     axes.plot(*place[inside].T, "D", ms=5, mfc="white", mec=INK, zorder=5)
@@ -199,9 +199,9 @@ def gap() -> Figure:
     made, (eye, above, area) = figure(10, 3.5, 3)
     parts, camera = cards()
     sampled, found, _ = sampled_cards()
-    apron, (y, x) = sampled.apron, (4, 3)
-    index = chosen_crossing(found, apron, y, x)
-    seen_from_the_eye(eye, found, apron)
+    border, (y, x) = sampled.border, (4, 3)
+    index = chosen_crossing(found, border, y, x)
+    seen_from_the_eye(eye, found, border)
     eye.add_patch(Rectangle((x + 0.3, y + 0.3), 1.4, 0.4, fc="none", ec=PINK, lw=1.3))
     place = float(found.place[index])
     seen_from_above(above, place, (place - 0.1, place + 0.1))
@@ -226,7 +226,7 @@ def matrix() -> Figure:
     sampled, found, row = sampled_cards()
     stencil, owners = sampled.stencil, np.repeat((0, 1), [len(one.ids) for one in sampled.samples])
     corner = CARD[2, :2] * (1, -1) + SIDE / 2
-    cell = tuple((np.floor(corner).astype(int) + sampled.apron)[::-1])
+    cell = tuple((np.floor(corner).astype(int) + sampled.border)[::-1])
     shades = ("#F2BE99", "#99C7E0")
     pixel.add_patch(Rectangle((0, 0), 1, 1, fc=shades[int(owners[row[0][cell]])], ec="none"))
     for quarter, (right, down) in enumerate(area_rule.CORNERS.astype(int)):

@@ -263,12 +263,12 @@ class Stencil:
         return [getattr(self, name) for name in names]
 
 
-@record(static=("supersample", "apron"))
+@record(static=("supersample", "border"))
 class Sampled(_OnCells):
     """A sampled scene, the result of `rts.sample` and the input of `rts.render_samples`.
 
-    The grid has an apron of cells around the image, so that samples just outside can splat into it. Here H and W are
-    the image's, times `supersample`, plus twice the apron.
+    The grid has a border of cells around the image, so that samples just outside can splat into it. Here H and W are
+    the image's, times `supersample`, plus twice the border.
 
     Attributes:
         samples: one `Samples` for each part. Parts that were sampled at once have no cells of their own.
@@ -276,7 +276,7 @@ class Sampled(_OnCells):
         overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`.
             Should be 0.
         supersample: s; each pixel has s² cells.
-        apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
+        border: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         stencil: areas and boundary terms beside outlines, for splatters that read them, or None. Its samples are rows
             of each part behind those of cells.
     """
@@ -285,7 +285,7 @@ class Sampled(_OnCells):
     cells: Cells
     overflow: Array
     supersample: int = 1
-    apron: int = 2
+    border: int = 2
     stencil: Stencil | None = None
 
     @property

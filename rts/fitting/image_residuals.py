@@ -445,7 +445,7 @@ class ImageResiduals(Residuals):
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
-        context, cells = context_of(vector), {"border": band.sampled.apron, "supersample": band.sampled.supersample}
+        context, cells = context_of(vector), {"border": band.sampled.border, "supersample": band.sampled.supersample}
         sampled = owned(band.sampled, band.sampled.row, context)
         known = constants(splats_of(sampled, band.parts, positions, rgba, context, **cells), engine, vector)
         loss = self.loss if self.loss.robust else None

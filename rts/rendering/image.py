@@ -211,14 +211,14 @@ def render_samples(
         The image (H, W, 4), or (H, W, C + 1), as in `render`.
 
     Raises:
-        InputError: an argument is wrong; the samples are of another number of parts, their apron is too narrow for the
+        InputError: an argument is wrong; the samples are of another number of parts, their border is too narrow for the
             splatter, or samples that it needs were left out.
         EngineError: torch and jax arrays in one scene, or arrays on two devices.
     """
     if not isinstance(sampled, Sampled):
         raise InputError(f"sampled is {quoted(sampled)}; expected what rts.sample gave")
-    apron, fine = sampled.apron, sampled.supersample
-    size = tuple((n - 2 * apron) // fine for n in sampled.row.shape[1:])
+    border, fine = sampled.border, sampled.supersample
+    size = tuple((n - 2 * border) // fine for n in sampled.row.shape[1:])
     scene = Scene.of(parts, camera, "auto", engine).at(size)
     if len(scene.parts) != len(sampled.samples):
         raise InputError(
@@ -229,13 +229,13 @@ def render_samples(
         raise InputError(
             f"the samples have no outlines, which {splatter!r} reads; give it to rts.sample, too, or take another"
         )
-    if apron < splatter.reach + 1:
+    if border < splatter.reach + 1:
         raise InputError(
-            f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
+            f"the samples have a border of {border} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{splatter.reach + 1}; give it to rts.sample, too"
         )
     if "outlines" not in splatter.reads:
-        sampled = _narrowed(replace(sampled, stencil=None), apron - splatter.reach - 1)
+        sampled = _narrowed(replace(sampled, stencil=None), border - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
     context = scene.context_with(sampled, background)
     grid = Grid.of_samples(sampled, scene.parts, scene.camera, context)
@@ -243,11 +243,11 @@ def render_samples(
 
 
 def _narrowed(sampled: Sampled, count: int) -> Sampled:
-    """Samples with an apron that is narrower by `count` cells."""
+    """Samples with a border that is narrower by `count` cells."""
     if count == 0:
         return sampled
     rows, columns = (slice(count, n - count) for n in sampled.row.shape[1:])
-    return replace(sampled, cells=sampled.cells.map(lambda x: x[..., rows, columns]), apron=sampled.apron - count)
+    return replace(sampled, cells=sampled.cells.map(lambda x: x[..., rows, columns]), border=sampled.border - count)
 
 
 def splatted(sampled: Sampled, scene: Scene, grid: Grid, context: Context, splatter: Splatter) -> Array:

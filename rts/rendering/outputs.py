@@ -176,10 +176,10 @@ def fronts_of(names: Sequence[str], sampled: Sampled, splats: Splats) -> list[Ar
     Raises:
         InputError: samples do not tell triangles.
     """
-    step, apron = sampled.supersample, sampled.apron
+    step, border = sampled.supersample, sampled.border
 
     def of_pixels(cells: Array) -> Array:
-        rows, columns = (slice(apron + step // 2, n - apron, step) for n in cells.shape)
+        rows, columns = (slice(border + step // 2, n - border, step) for n in cells.shape)
         return cells[rows, columns][..., None]
 
     fronts = []

@@ -38,7 +38,7 @@ def sample(
         camera: as in `render`.
         size: as in `render`.
         sampler: as in `render`.
-        splatter: the splatter for these samples: the apron suits its reach, and outlines are found if it reads them.
+        splatter: the splatter for these samples: the border suits its reach, and outlines are found if it reads them.
             None takes all layers, without outlines.
         layers: as in `render`; with no splatter "auto" is the number of layers that there are, up to 16.
         supersample: as in `render`.
@@ -72,8 +72,8 @@ def sampled_scene(
     samples that were found on the host stay there as they are, without `with_attributes` and `in_engine`.
     """
     factor, capacity = settings.supersample, settings.capacity
-    apron, outlines = settings.apron, settings.finds_outlines
-    height, width = grid.size[0] - 2 * apron, grid.size[1] - 2 * apron
+    border, outlines = settings.border, settings.finds_outlines
+    height, width = grid.size[0] - 2 * border, grid.size[1] - 2 * border
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     given, (scene, grid) = scene, on_the_host(scene, grid)
     required = settings.required([given] if one_shader else None)
@@ -86,7 +86,7 @@ def sampled_scene(
 
         sampled = sampled_by_one_call(scene, grid, layers, required, same, capacity)
     if sampled is not None:
-        return replace(sampled, supersample=factor, apron=apron)
+        return replace(sampled, supersample=factor, border=border)
     at_once, none = None, [False] * len(scene.parts)
     if scene.cameras and capacity is None and not settings.fronts:
         from rts.outlines.of_joint import AtOnce
@@ -114,5 +114,5 @@ def sampled_scene(
         if layers != "auto" or not has_full_stacks(sampled, scene.opaque):
             break
         least = 2 * sampled.row.shape[-3]
-    sampled = replace(sampled, supersample=factor, apron=apron)
+    sampled = replace(sampled, supersample=factor, border=border)
     return in_engine(with_attributes(sampled, given), given) if scene.cameras and not stays else sampled

@@ -20,10 +20,10 @@ from rts.scene.camera import Camera
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
 
-APRON = 2
+BORDER = 2
 """Cells sampled beyond each side of the image where no splatter tells its reach."""
 
-OUTLINES_APRON = 1
+OUTLINES_BORDER = 1
 """How many more are sampled where outlines are found: how an outline turns within the dual cells of the outermost cells
 is told by the two crossings that come next along it, the second of which is two dual cells farther out. So a window, or
 a view beside others, shows of them what the whole image does."""
@@ -97,19 +97,19 @@ class RenderSettings:
         return TRACED_LAYERS[False] if self.layers == "auto" else self.layers
 
     @property
-    def apron(self) -> int:
-        """Number of cells sampled beyond each side of the image: the splatter's reach plus one, and `OUTLINES_APRON`.
+    def border(self) -> int:
+        """Number of cells sampled beyond each side of the image: the splatter's reach plus one, and `OUTLINES_BORDER`.
 
         Samples within reach affect the image, and splatters may read one cell beside theirs.
         """
         if self.splatter is None:
-            return APRON
-        return self.splatter.reach + 1 + (OUTLINES_APRON if "outlines" in self.splatter.reads else 0)
+            return BORDER
+        return self.splatter.reach + 1 + (OUTLINES_BORDER if "outlines" in self.splatter.reads else 0)
 
     def grid(self, scene: Scene, camera: Camera, size: tuple[int, int]) -> Grid:
         """The cells of an image (height, width) of a scene, or of a window of it, through its camera."""
         cells = self.supersample * size[0], self.supersample * size[1]
-        return Grid.of_parts(scene.parts, camera, cells, self.apron, scene.context)
+        return Grid.of_parts(scene.parts, camera, cells, self.border, scene.context)
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
         """(first row, number of rows) of each band of an image (height, width).

@@ -23,7 +23,7 @@ _OPAQUE = attrgetter("shader.opaque")
 
 
 def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, grid: Grid, context: Context) -> Splats:
-    """Evaluate, shade and project samples into splats, with the apron as border. Fine samples are left out.
+    """Evaluate, shade and project samples into splats, which keep the border. Fine samples are left out.
 
     Args:
         sampled: the samples.
@@ -56,7 +56,7 @@ def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, gr
         # A shader may close over arrays of an engine that the scene has none of.
         positions, colors = context_of(positions, colors).constants((positions, colors))
     placed, rgba = concatenated(positions, colors)
-    return splats_of(sampled, parts, placed, rgba, context, border=sampled.apron, supersample=sampled.supersample)
+    return splats_of(sampled, parts, placed, rgba, context, border=sampled.border, supersample=sampled.supersample)
 
 
 def owned(tree: Tree, row: Array, context: Context) -> Tree:

@@ -1,6 +1,6 @@
 """The layout of several views in one picture, so that one splat serves all views.
 
-Each view keeps the apron that it was sampled with, so no splat of another view reaches its image.
+Each view keeps the border that it was sampled with, so no splat of another view reaches its image.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Picture(NamedTuple):
 
     Attributes:
         views: B, the number of views.
-        view: height and width of each, in cells, with its apron.
+        view: height and width of each, in cells, with its border.
         down: lines of views.
         across: views in a line.
     """
@@ -87,7 +87,7 @@ class Picture(NamedTuple):
 
 
 def at_once(view: tuple[int, int]) -> int:
-    """Number of views of (height, width) cells, aprons included, that fit into one picture."""
+    """Number of views of (height, width) cells, borders included, that fit into one picture."""
     return max(1, (SIDE // view[0]) * (SIDE // view[1]))
 
 

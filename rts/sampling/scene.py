@@ -119,20 +119,20 @@ class Grid(NamedTuple):
     @classmethod
     def of_samples(cls, sampled: Sampled, parts: Sequence[Part], camera: Camera, context: Context) -> Grid:
         """The grid of samples of parts that are seen by a camera; see `of_parts`."""
-        height, width = (n - 2 * sampled.apron for n in sampled.row.shape[1:])
-        return cls.of_parts(parts, camera, (height, width), sampled.apron, context)
+        height, width = (n - 2 * sampled.border for n in sampled.row.shape[1:])
+        return cls.of_parts(parts, camera, (height, width), sampled.border, context)
 
     @classmethod
     def of_parts(
-        cls, parts: Sequence[Part], camera: Camera, size: tuple[int, int], apron: int, context: Context
+        cls, parts: Sequence[Part], camera: Camera, size: tuple[int, int], border: int, context: Context
     ) -> Grid:
-        """The grid of an image (height, width) of cells with an apron, in which there are parts.
+        """The grid of an image (height, width) of cells with a border, in which there are parts.
 
         The views of cameras are arrays of the context's engine, if it differentiates.
         """
         # One engine samples every part, through the same matrices that later project the samples.
         if context.engine.differentiates:
             camera = camera.replace(view=context.constants(camera.view))
-        cells = size[0] + 2 * apron, size[1] + 2 * apron
-        camera = camera.window(size, (-apron, -apron), cells)
+        cells = size[0] + 2 * border, size[1] + 2 * border
+        camera = camera.window(size, (-border, -border), cells)
         return cls(camera, cells, [camera.within(part.transform) for part in parts])

@@ -280,10 +280,10 @@ class Camera(CameraConverters):
             _, (view, transform) = promote(view, transform)
         return self.replace(view=matmul(view, transform))
 
-    def with_apron(self, size: tuple[int, int], apron: int) -> Camera:
-        """The camera of the image with `apron` more pixels on every side."""
+    def with_border(self, size: tuple[int, int], border: int) -> Camera:
+        """The camera of the image with `border` more pixels on every side."""
         height, width = size
-        return self.window(size, (-apron, -apron), (height + 2 * apron, width + 2 * apron))
+        return self.window(size, (-border, -border), (height + 2 * border, width + 2 * border))
 
     def window(self, size: tuple[int, int], corner: tuple[int, int], extent: tuple[int, int]) -> Camera:
         """The camera of a rectangle of the image, which may reach beyond it.

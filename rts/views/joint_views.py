@@ -29,7 +29,7 @@ def sampled_at_once(views: Sequence[DrawnView], picture: Picture, settings: Rend
     at_once = AtOnce(joint, grid, scene.opaque if outlines else [False] * len(scene.parts))
     sampled = at_once.found(at_once.centres(layers), required if outlines else None, real_of(scene), same)
     sampled, counts = _by_place(with_attributes(sampled, scene), [len(view.proxies) for view in views])
-    sampled = replace(in_engine(sampled, scene), supersample=settings.supersample, apron=settings.apron)
+    sampled = replace(in_engine(sampled, scene), supersample=settings.supersample, border=settings.border)
     return with_counts(sampled, picture, counts)
 
 

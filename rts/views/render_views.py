@@ -178,7 +178,7 @@ def _images_of_scene(
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
     if settings.layers != "auto" and len(settings.bands(size)) == 1:
-        height, width = (settings.supersample * n + 2 * settings.apron for n in size)
+        height, width = (settings.supersample * n + 2 * settings.border for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         # Which rows are in use is unknown if they are padded, so that one call must serve all views.
@@ -241,7 +241,7 @@ def _as_pictures(
     parts = [scene.parts for scene in scenes]
     assert splatter is not None
     for views, splats in zip(pictures, views_to_splats(pictures, parts, cameras, context), strict=True):
-        cells = views.picture.split(cropped_image(splatter, splats), views.sampled.apron)
+        cells = views.picture.split(cropped_image(splatter, splats), views.sampled.border)
         xp, (count, height, width, channels), factor = namespace(cells), cells.shape, views.sampled.supersample
         cells = averaged(xp.reshape(cells, (count * height, width, channels)), factor)
         images.append(xp.reshape(cells, (count, height // factor, width // factor, channels)))

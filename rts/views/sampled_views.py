@@ -19,7 +19,7 @@ class Views(NamedTuple):
     """Samples of several views, side by side.
 
     Attributes:
-        sampled: the samples, on the grid of the picture; the apron is that of each view. In the table of a part the
+        sampled: the samples, on the grid of the picture; the border is that of each view. In the table of a part the
             samples of one view stand together, in the order of the views. Parts have a cell for each row.
         picture: the layout of the views.
         view: for each part (N,) int32, the number of each row's view, from 1 on.

@@ -31,7 +31,7 @@ def views_to_splats(
     cameras: Sequence[Camera],
     context: Context,
 ) -> list[Splats]:
-    """The splats of pictures of several views. They have no border: each view keeps its apron.
+    """The splats of pictures of several views. They have no border around all views: each view keeps its own.
 
     A part that all views share is evaluated once, at the samples of all, so that results for the whole of θ serve all.
     Shaders that take views are called once, if θ has the same entries for them in every view; others are called view by
@@ -45,7 +45,7 @@ def views_to_splats(
     """
     sampled = [picture.sampled for picture in pictures]
     sampled = owned(sampled, sampled[0].row, context)
-    (height, width), border = pictures[0].picture.view, sampled[0].apron
+    (height, width), border = pictures[0].picture.view, sampled[0].border
     cells = height - 2 * border, width - 2 * border
     grids = [Grid.of_parts(*one, cells, border, context) for one in zip(parts, cameras, strict=True)]
     shown = [

@@ -75,7 +75,7 @@ def why_stepped(subject: Subject, number: Number, connect: bool = False, far: bo
         return None
     if abs(after[place] - before[place]) <= max(STAYS * whole, COLOR_JUMP):
         return None
-    y, x = (i + sampled.apron for i in place[:2])
+    y, x = (i + sampled.border for i in place[:2])
     seen = sampled.part[:, y, x]
     seen = subject.engine.to_numpy(seen) if subject.engine.owns(seen) else np.asarray(seen)
     parts = variants.names(sorted({int(part) for part in seen if part >= 0}), "or")

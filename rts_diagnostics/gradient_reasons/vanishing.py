@@ -155,11 +155,11 @@ class _Trial:
     def seen_outside(self, change: Change | None = None) -> bool:
         """True if a larger window, or a camera moved back or ahead, sees the number's effect, after `change` if any."""
         height, width = self.subject.size
-        apron = max(height, width)
-        larger = height + 2 * apron, width + 2 * apron
+        border = max(height, width)
+        larger = height + 2 * border, width + 2 * border
         changes = [] if change is None else [change]
-        mask = self._changed(variants.all_of(*changes, variants.wider(self.subject.size, apron)), size=larger)
-        mask[apron : apron + height, apron : apron + width] = False
+        mask = self._changed(variants.all_of(*changes, variants.wider(self.subject.size, border)), size=larger)
+        mask[border : border + height, border : border + width] = False
         if mask.any():
             return True
         near = abs(float(self.subject.shown(self.subject.parameters)[1].for_size(self.subject.size).depth_range()[0]))

@@ -42,9 +42,9 @@ def unbounded(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
     return [p if s is None else p.replace(surface=s) for p, s in zip(parts, surfaces, strict=True)], camera
 
 
-def wider(size: tuple[int, int], apron: int) -> Change:
-    """A change to a larger window, for images with `apron` more pixels on every side."""
-    return lambda parts, camera: (parts, camera.with_apron(size, apron))
+def wider(size: tuple[int, int], border: int) -> Change:
+    """A change to a larger window, for images with `border` more pixels on every side."""
+    return lambda parts, camera: (parts, camera.with_border(size, border))
 
 
 def farther(distance: float) -> Change:

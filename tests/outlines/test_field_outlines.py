@@ -202,7 +202,7 @@ def paired(name, way):
     part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
     found, outlines = sampled_with_outlines(part, camera(eye), SIZE, **options)
     points = np.asarray(surface.evaluate(part.theta, found.samples[0])["position"])
-    wide = camera(eye).for_size(SIZE).with_apron(SIZE, found.apron)
+    wide = camera(eye).for_size(SIZE).with_border(SIZE, found.border)
     places = np.asarray(wide.project(points, found.row.shape[1:]))
     return outlines, places[np.maximum(outlines.rows[:, 4:], 0)], places
 

@@ -298,12 +298,12 @@ class Far(rts.Splatter):
 
 
 @pytest.mark.parametrize("reach", [1, 2, 4])
-def test_the_apron_is_as_wide_as_a_splatter_reaches(reach):
+def test_the_border_is_as_wide_as_a_splatter_reaches(reach):
     part, splatter = mesh_part(quad(-9, 9, -9, 9)), Far(reach)
     assert (show(part, FRONT, splatter=splatter)[..., 3] == 1).all()
     assert splatter.seen.border == reach + 1
     sampled = rts.sample(part, FRONT, SIZE, splatter=splatter)
-    assert sampled.apron == reach + 1 and sampled.row.shape[1:] == tuple(n + 2 * reach + 2 for n in SIZE)
+    assert sampled.border == reach + 1 and sampled.row.shape[1:] == tuple(n + 2 * reach + 2 for n in SIZE)
     np.testing.assert_array_equal(
         rts.render_samples(sampled, part, FRONT, splatter=splatter), show(part, FRONT, splatter=splatter)
     )
@@ -312,15 +312,15 @@ def test_the_apron_is_as_wide_as_a_splatter_reaches(reach):
     )
 
 
-def test_samples_with_too_narrow_an_apron_are_refused():
+def test_samples_with_too_narrow_an_border_are_refused():
     part = mesh_part(quad())
     sampled = rts.sample(part, FRONT, SIZE, splatter="single")
-    with refused("an apron of 2 cells, and .* which reaches 3, needs 4; give it to rts.sample"):
+    with refused("a border of 2 cells, and .* which reaches 3, needs 4; give it to rts.sample"):
         rts.render_samples(sampled, part, FRONT, splatter=Far(3))
 
 
 @pytest.mark.parametrize("splatter", ["none", "single", "multi"])
-def test_samples_for_no_splatter_have_an_apron_for_every_built_in_one(splatter):
+def test_samples_for_no_splatter_have_an_border_for_every_built_in_one(splatter):
     part = mesh_part(icosphere(1, 2.0))
     found = rts.render_samples(rts.sample(part, FRONT, SIZE, splatter=None, layers=2), part, FRONT, splatter=splatter)
     np.testing.assert_allclose(found, show(part, FRONT, splatter=splatter), rtol=0, atol=1e-6)

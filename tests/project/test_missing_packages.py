@@ -15,7 +15,7 @@ import rts
 from rts import InputError, Part
 from rts.errors import PluginError
 from rts.scene.camera import perspective
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 
 pytestmark = pytest.mark.core
 
@@ -295,7 +295,7 @@ def test_an_image_beyond_the_device_is_refused_and_the_next_render_works(tall):
             rts.render(part, CAMERA, size, sampler=sampler)
         message = str(error.value)
         assert (
-            f"{size[0] + 2 * (APRON + 1)} × {size[1] + 2 * (APRON + 1)} pixels" in message
+            f"{size[0] + 2 * (BORDER + 1)} × {size[1] + 2 * (BORDER + 1)} pixels" in message
             and f"at most {limit} × {limit}" in message
         )
         assert "'raster'" in message and "\n" not in message

@@ -27,7 +27,7 @@ from helpers import (
 import rts
 from rts import Camera, Part
 from rts.shading.shaders import Lambert, Textured
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 
 pytestmark = pytest.mark.rendering
 
@@ -55,7 +55,7 @@ def test_render_is_sample_then_render_samples(target):
     assert image.shape == (*SIZE, 4) and image.dtype == np.float32
     assert sampled.row.shape[0] == 1 and sampled.stencil is not None
     sampled = rts.sample(part, camera, SIZE, splatter=None, layers=3)
-    assert sampled.row.shape == (3, *(n + 2 * APRON for n in SIZE)) and int(sampled.overflow) == 0
+    assert sampled.row.shape == (3, *(n + 2 * BORDER for n in SIZE)) and int(sampled.overflow) == 0
 
 
 @pytest.mark.parametrize("splatter", ["none", "single", "multi"])
@@ -122,7 +122,7 @@ def test_normals_under_a_stretch_are_those_of_the_ellipsoid():
     part = mesh_part((vertices, faces), theta={"normals": vertices}, transform=transform, shader="normals")
     image = show(part, splatter="none")
     sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
-    row = sampled.row[0, APRON:-APRON, APRON:-APRON]
+    row = sampled.row[0, BORDER:-BORDER, BORDER:-BORDER]
     points = moved(transform, part.surface.evaluate(part.theta, sampled.samples[0])["position"])[row]
     expected = points / np.array([1.5, 0.75, 1.0]) ** 2
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)

@@ -169,7 +169,7 @@ def test_a_background_has_its_gradient_over_bands_of_constants(target, narrow_ba
 def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
     sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
-    assert sampled.row.shape == (1, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
+    assert sampled.row.shape == (1, *(2 * n + 2 * sampled.border for n in SIZE)) and sampled.supersample == 2
     np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
 
 

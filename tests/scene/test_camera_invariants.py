@@ -133,18 +133,18 @@ def test_the_ray_of_a_pixel_is_that_of_its_middle_part(camera, size, factor, dep
 
 @PROPERTIES
 @given(scenes(), st.integers(0, 9))
-def test_an_apron_moves_pixels_by_its_width_and_nothing_else(scene, apron):
+def test_a_border_moves_pixels_by_its_width_and_nothing_else(scene, border):
     camera, size, points, _ = scene
-    wide = size[0] + 2 * apron, size[1] + 2 * apron
-    close(camera.with_apron(size, apron).project(points, wide), camera.project(points, size) + [apron, apron, 0])
+    wide = size[0] + 2 * border, size[1] + 2 * border
+    close(camera.with_border(size, border).project(points, wide), camera.project(points, size) + [border, border, 0])
 
 
 @PROPERTIES
 @given(cameras(), sizes(8), st.integers(0, 4))
-def test_the_rays_inside_an_apron_are_those_without_it(camera, size, apron):
-    found = camera.with_apron(size, apron).rays((size[0] + 2 * apron, size[1] + 2 * apron))
+def test_the_rays_inside_a_border_are_those_without_it(camera, size, border):
+    found = camera.with_border(size, border).rays((size[0] + 2 * border, size[1] + 2 * border))
     expected = camera.rays(size)
-    inside = slice(apron, apron + size[0]), slice(apron, apron + size[1])
+    inside = slice(border, border + size[0]), slice(border, border + size[1])
     close(found.origins[inside], expected.origins)
     close(found.directions[inside], expected.directions)
     close(found.spread, expected.spread)

@@ -8,7 +8,7 @@ from seen import CAMERA, SIZE, VIEWS, WEIGHTS, rays_spread, stages
 
 import rts
 from rts.testing import SurfaceConformance
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 from rts_testing.derivatives import claim_slope, directions
 
 pytestmark = pytest.mark.sampling
@@ -22,7 +22,7 @@ def test_a_flat_patch_is_met_where_its_plane_is():
     points = np.stack([x, y, 0.25 * x - 0.5 * y], axis=-1).reshape(-1, 3).astype(np.float32)
     part = rts.Part(Bezier([np.arange(16)], 2), {"points": points}, "normals")
     samples = rts.sample(part, FRONT, SIZE, layers=1, splatter=None).samples[0]
-    rays = FRONT.with_apron(SIZE, APRON).rays(samples.row.shape[1:])
+    rays = FRONT.with_border(SIZE, BORDER).rays(samples.row.shape[1:])
     cells = samples.row[0] >= 0
     x, y = rays.origins[cells][:, :2].T
     assert len(x) > 100
@@ -50,7 +50,7 @@ def test_the_scene_has_layers_that_change_places_meet_and_miss():
 def test_settled_layers_are_front_to_back_without_gaps_on_centres_of_pixels(view, layers):
     camera = VIEWS[view]
     samples = rts.sample(BEZIER, camera, SIZE, layers=layers, splatter=None).samples[0]
-    covered, wide = samples.row >= 0, camera.with_apron(SIZE, APRON)
+    covered, wide = samples.row >= 0, camera.with_border(SIZE, BORDER)
     assert covered[1].sum() > 5 and not (covered[1:] & ~covered[:-1]).any()
     spread = rays_spread(camera)
     apart, behind = np.diff(samples.depth, axis=0)[covered[1:]], samples.depth[1:][covered[1:]]

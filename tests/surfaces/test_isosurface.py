@@ -348,8 +348,8 @@ def test_attributes_are_functions_of_position():
     inside = image[..., 3] > 0.99
     sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
     position = part.surface.evaluate(part.theta, sampled.samples[0])["position"]
-    apron = sampled.apron
-    row = sampled.row[0, apron:-apron, apron:-apron]
+    border = sampled.border
+    row = sampled.row[0, border:-border, border:-border]
     assert inside.sum() > 200
     # Splatting blends colours of neighbours, which differ where another part of the surface begins.
     off = np.abs(image[inside][:, :3] - (0.5 + 0.2 * position[row])[inside])

@@ -18,7 +18,7 @@ from rts.plugin_api.records import Samples
 from rts.sampling import layer_order
 from rts.testing import OperationConformance
 from rts_surfaces.patches import bicubic, tile_triangles
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 
 pytestmark = pytest.mark.sampling
 
@@ -170,7 +170,7 @@ def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(d
     theta = {"points": part.theta["points"].astype(np.float64)}
     position = part.surface.evaluate(theta, sampled.samples[0])["position"]
     layer, y, x = np.nonzero(sampled.row >= 0)
-    wide = camera.for_size(size).with_apron(size, APRON)
+    wide = camera.for_size(size).with_border(size, BORDER)
     pixels = wide.project(position[sampled.row[layer, y, x]], sampled.row.shape[1:])
     off = np.abs(pixels[:, :2] - np.stack([x, y], axis=-1) - 0.5).max(axis=1)
     assert off.max() < 1e-3

@@ -277,8 +277,8 @@ def test_colours_are_those_of_the_ray_that_meets_the_surface():
     found = part.surface.evaluate(part.theta, samples)["position"]
     eye = np.linalg.inv(CAMERA.view)[:3, 3]
     expected = plainly(part.theta["weights"], found, unit(found - eye))[1]
-    apron = (samples.row.shape[1] - SIZE[0]) // 2
-    row = samples.row[0, apron : apron + SIZE[0], apron : apron + SIZE[1]]
+    border = (samples.row.shape[1] - SIZE[0]) // 2
+    row = samples.row[0, border : border + SIZE[0], border : border + SIZE[1]]
     assert (row >= 0).sum() > 100
     np.testing.assert_allclose(image[row >= 0][:, :3], expected[row[row >= 0]], atol=1e-4)
     np.testing.assert_array_equal(image[..., 3], row >= 0)

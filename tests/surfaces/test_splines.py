@@ -8,7 +8,7 @@ import rts
 from rts import Camera, InputError, Part
 from rts_surfaces.patches import tile_triangles
 from rts_surfaces.patches.bspline import extraction
-from rts_testing.compatibility import APRON
+from rts_testing.compatibility import BORDER
 
 pytestmark = pytest.mark.sampling
 
@@ -138,7 +138,7 @@ def test_samples_reproject_to_the_centres_of_their_pixels():
         sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
         position = at_samples(part, sampled.samples[0])
         cells = np.argwhere(sampled.row >= 0)
-        wide = CAMERA.for_size(SIZE).with_apron(SIZE, APRON)
+        wide = CAMERA.for_size(SIZE).with_border(SIZE, BORDER)
         pixels = wide.project(position[sampled.row[tuple(cells.T)]], sampled.row.shape[1:])
         off = np.abs(pixels[:, :2] - cells[:, :0:-1] - 0.5).max(axis=1)
         # float32 for u and v; the compiled splatters ask for 2.5e-4.

@@ -21,7 +21,7 @@ except rts.errors.PluginError as missing:
 
 from rts_surfaces.subdivision.binding import UV, Limit, Rules  # noqa: E402
 from rts_surfaces.subdivision.cage_checks import checked_cage  # noqa: E402
-from rts_testing.compatibility import APRON  # noqa: E402
+from rts_testing.compatibility import BORDER  # noqa: E402
 
 SIZE = (60, 80)
 CAMERA = Camera.look_at((1.5, 1.8, 4.0), (0, 0, 0), fov_y=40)
@@ -269,7 +269,7 @@ def test_a_hole_of_a_flat_sheet_is_empty_and_all_else_as_without_it(tmp_path):
     path.write_text("\n".join([*lines, "t hole 1/0/0 4"]))
     (loaded,) = rts.load(path, surface="subdivision")
     camera, size = rts.Camera.orthographic((1.5, 1.5, 5), (1.5, 1.5, 0), height=4), (41, 41)
-    rays = camera.with_apron(size, APRON).rays((41 + 2 * APRON, 41 + 2 * APRON))
+    rays = camera.with_border(size, BORDER).rays((41 + 2 * BORDER, 41 + 2 * BORDER))
     x, y = rays.origins[..., 0], rays.origins[..., 1]
     inside = (np.abs(x - 1.5) < 1.5) & (np.abs(y - 1.5) < 1.5)
     hole = (np.abs(x - 1.5) < 0.5) & (np.abs(y - 1.5) < 0.5)

@@ -129,7 +129,7 @@ def lacking(view, samples):
 
 
 def _fronts(samples, height):
-    """Depths (H, W) of the samples in front, without the apron; NaN where there is none."""
-    apron = (samples.row.shape[1] - height) // 2
+    """Depths (H, W) of the samples in front, without the border; NaN where there is none."""
+    border = (samples.row.shape[1] - height) // 2
     depth = np.where(samples.row[0] >= 0, samples.depth[0], np.nan).astype(np.float64)
-    return depth[apron : depth.shape[0] - apron, apron : depth.shape[1] - apron]
+    return depth[border : depth.shape[0] - border, border : depth.shape[1] - border]

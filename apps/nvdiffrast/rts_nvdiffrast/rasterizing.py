@@ -176,7 +176,7 @@ def _triangles(image: Image, size: tuple[int, int], layer: int) -> torch.Tensor:
     # A splatter that needs only fronts has hidden samples left out.
     needs = "none" if layer == 0 else None
     sampled = rts.sample(part, image.seen.camera, size, sampler="raster", layers=layer + 1, splatter=needs)
-    border = sampled.apron
+    border = sampled.border
     row = sampled.row[layer, border : border + size[0], border : border + size[1]]
     ids = sampled.samples[0].ids[:, 0]
     return torch.cat([ids, torch.full_like(row[0, :1], -1)])[row.long()]  # Row −1, for none, is the last.
