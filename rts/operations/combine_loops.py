@@ -140,7 +140,7 @@ def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
 
 @loop
 def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
-    """Add to `g_rows` (V, C) the gradient of the rows, from `g` (N, C)."""
+    """Add to `g_rows` (V, C) the gradient of the rows `ids` of each sample, from that of the result, `g` (N, C)."""
     one = g.dtype.type(1)
     for n in range(len(ids)):
         if not _all_known(ids, n, column, count, len(g_rows)):

@@ -69,7 +69,7 @@ class _Rise:
         return self._xp.roll(x, -steps, axis=self._axis)
 
     def slope(self) -> Array:
-        """The slope of the surface in each cell; where one side shows another surface, that of the other side."""
+        """The change of depth a cell: the mean of both sides, or that of the only side that shows the surface."""
         xp, a, b = self._xp, self._ahead, self._back
         smooth, smaller = abs(a - b) <= self._unit + xp.minimum(abs(a), abs(b)), xp.where(abs(a) < abs(b), a, b)
         # Of something thin both sides show another surface.

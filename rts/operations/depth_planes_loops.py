@@ -56,7 +56,7 @@ def _beyond(first, second, known, unit):
 
 @loop
 def _even(start, stop, depth, row, lens, out):
-    """Fill even depths and their units, the first two channels of `out`."""
+    """Fill the first two channels of `out`: depths that are linear in the image on a plane, and their unit."""
     for y in range(start, stop):
         for x in range(row.shape[1]):
             out[0, y, x], out[1, y, x] = 0, 0

@@ -174,15 +174,16 @@ def _intervals(
 
 
 def _directions(found: _Intervals, gap: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Unit directions (B, 2) of outlines at crossings, by where these are `BESIDE`; 0 where they are unknown.
+    """Unit directions (B, 2) of outlines at crossings: each is sought again on a line `BESIDE` cells away.
 
-    Only where more than two are on the sides of a square of centres, and so it is not plain which belong together.
+    They are 0 where nothing is found there, and where a dual cell has no more than two crossings, so that it is plain
+    which belong together.
 
     Args:
-        found: their intervals.
+        found: the interval of each crossing, in which it was found.
         gap: (B, 3), see `Gaps`.
-        gaps: the lines of intervals.
-        oracle: the scene.
+        gaps: the lines on which the intervals lie.
+        oracle: tells what is seen anywhere.
     """
     y, x, axis = gap.T
     squares = (y + 1 - axis, x + axis), (y + 1, x + 1)

@@ -39,7 +39,7 @@ class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple], required: Required):
-        """Take of each part its sampler, camera, entry and, where triangles tell all, the seen mesh."""
+        """Take a tuple of each part: its sampler, camera, entry, and its `SeenMesh` where samples stay on triangles."""
         self._scene, self._grid, self._parts, self._required = scene, grid, parts, required
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 

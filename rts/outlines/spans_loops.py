@@ -376,7 +376,7 @@ def _piece(start, count):
 
 @compiled(inline="always")
 def _sort(begin, stop, starts, order):
-    """Sort a part of `order` by `starts`, then by itself: Shell's sort."""
+    """Sort a part of `order` by `starts`, those that are equal by their numbers: Shell's sort."""
     step = 1
     while 3 * step < stop - begin:
         step = 3 * step + 1

@@ -91,9 +91,10 @@ def _linear(matrix: Array) -> Array:
 
 
 def _cofactors(matrix: Array) -> tuple[Array, Array]:
-    """The cofactors of the linear part of affine maps (..., 4, 4), times the sign of its determinant: rows (..., 3, 4).
+    """Maps (..., 3, 4) that turn normals as affine maps (..., 4, 4) turn surfaces; and their signs (..., 1, 1).
 
-    Also this sign (..., 1, 1): 1, or −1 for a mirror.
+    They are the cofactors of the linear part, times the sign of its determinant, and a column of zeros. The sign is 1,
+    or −1 for a mirror.
     """
     xp, rows = namespace(matrix), matrix[..., :3, :3]
     # Each row is the cross product of the next two.

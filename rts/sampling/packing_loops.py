@@ -41,8 +41,8 @@ def pack(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Rows for some cells, part after part, and those of a part layer by layer; then for fragments beside.
 
-    A part without any has one row, in the middle of its first triangle; zeros if it has no triangles. Cells without a
-    row have −1 and 0. They are those that are not taken, and those beyond the capacity.
+    A part without samples has one row, in the middle of its first triangle; zeros if it has no triangles. Cells that
+    are not taken, or are beyond the capacity, have row −1 and depth 0.
 
     Args:
         fragments: (K, H, W), whose triangles are counted over all parts.

@@ -14,7 +14,10 @@ from rts.compiling.loops import compiled, loop
 
 @compiled
 def corners_of(t, rows, vertices, faces, corners):
-    """Fill `corners` (3, 4) of a triangle; `rows` is `Camera.pixel_rows`. Returns the sign of its determinant."""
+    """Fill `corners` (3, 4), rows of (X, Y, w, depth), of a triangle; `rows` is `Camera.pixel_rows`.
+
+    Returns the sign of the determinant of their X, Y and w, which tells the side that is seen.
+    """
     for c in range(3):
         v = faces[t, c]
         x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])

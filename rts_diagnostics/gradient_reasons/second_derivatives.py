@@ -44,7 +44,10 @@ class HessianCheck(NamedTuple):
 
     @property
     def agreement(self) -> np.ndarray:
-        """(n, n) bool, true where both agree but for tolerance, three error bars and 1 % of the largest."""
+        """(n, n) bool: automatic second derivatives and differences differ by at most what may be.
+
+        That is the sum of the tolerance, three error bars, and 1 % of the effect of the largest entry.
+        """
         effects = self.steps[:, None] * self.steps
         sizes = np.abs([self.autodiff, self.difference]) * effects
         largest = np.max(sizes, where=np.isfinite(sizes), initial=0.0)

@@ -65,7 +65,7 @@ def centres(start, stop, blocks, side, shape, low, step, places):
 
 @loop
 def centre_numbers(blocks, side, shape):
-    """The numbers (B,) int64 in the lattice of the centres of blocks (B, 3); −1 where a block is cropped.
+    """Flat indices (B,) int64 in the lattice of the centres of blocks (B, 3); −1 where the lattice ends inside a block.
 
     `side`, the cells along each side of a block, is even. `shape` is the number of points along each axis.
     """

@@ -173,7 +173,7 @@ class FunctionOnLattice(Field):
         return ids.astype(np.int32), {"points": whole.astype(np.int32)}
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """Levels (M,), differentiable; and for each sample the indices (N, 6) int32 of its six values among them."""
+        """Levels (M,), differentiable, and the indices (N, 6) int32 among them of the points around each sample."""
         if self.table:
             if "points" not in samples.tables:
                 raise InputError("the samples have no table of lattice points, and the surface has one; sample it anew")

@@ -87,7 +87,7 @@ class LatticeField(ScalarField):
         return points, tables
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), float32 at least, and the indices (N, 6) among them of each sample's six values."""
+        """All values (M,), float32 at least, and the indices (N, 6) among them of the points around each sample."""
         values = self.in_theta_dtype(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
