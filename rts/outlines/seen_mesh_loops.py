@@ -173,7 +173,7 @@ def seams(first, last, part, triangle, mesh, met, colors, joined):
                 next_ = keep[t] != 0 and (adjacent[t, 0] == s or adjacent[t, 1] == s or adjacent[t, 2] == s)
                 # Around a corner that two triangles have in common the patch neither ends nor turns away.
                 if not next_ and (met[axis, line, x] != 0 or not _touch(faces, t, s)):
-                    start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
+                    start, at = (x + 0.5, line + 0.5) if axis == 0 else (line + 0.5, x + 0.5)
                     end = _walked(t, s, start, axis, at, seen, faces, adjacent)
                 joined[axis, y, x] = end == s
 

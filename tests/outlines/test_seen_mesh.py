@@ -255,6 +255,24 @@ def test_patches_join_the_centres_between_which_they_go_on():
     np.testing.assert_array_equal(joined, both)
 
 
+def test_patches_of_deeper_layers_are_walked_over_as_those_in_front():
+    vertices, faces = icosphere(3)
+    proxy, sampler = Proxy(3 * vertices.astype(np.float32), faces), rts.plugin("rts.samplers", "reference")()
+    seen = sampler.rasterize(sampler.prepare(proxy), CAMERA, SIZE, 2, "none")
+    own = SeenMesh.of(proxy, CAMERA, SIZE, "none")
+
+    def joined(layers):
+        triangle, depth = (np.concatenate([x[k] for k in layers]) for x in (seen.triangle_ids, seen.depth))
+        part = np.where(triangle >= 0, 0, -1).astype(np.int32)
+        hits, found = Hits(*map(read_only, (part, triangle, np.float64(depth)))), np.zeros((2, *part.shape), bool)
+        own.join(hits, np.zeros((2, *SIZE), np.uint8), True, found)
+        return found
+
+    both, front, back = joined([0, 1]), joined([0]), joined([1])
+    np.testing.assert_array_equal(both, np.concatenate([front, back], axis=1))
+    assert (front.sum(), back.sum()) == pytest.approx((48, 48), abs=8)
+
+
 @pytest.mark.parametrize("colors", [False, True])
 def test_patches_of_a_part_that_intersect_are_told_apart_by_colours_alone(colors):
     far = [(-60, -60), (60, -60), (1, 100)]
