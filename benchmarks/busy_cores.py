@@ -1,8 +1,12 @@
 """Steps of a pose's fit where other processes compute on every core, by the threads that torch may use.
 
-One process that multiplies numbers for each core is started and ended; medians in turn, idle and busy:
+For each core a process that multiplies numbers is started, and ended afterwards. Medians, in turn:
 
     python -m benchmarks.busy_cores
+    GOMP_SPINCOUNT=300000 python -m benchmarks.busy_cores
+
+The package `benchmarks` sets how idle threads of torch wait, as `import rts` does where it comes before torch. The
+second command has them spin, as they do where torch comes first.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-import rts  # Before torch, so that its idle threads do not spin.
+import rts
 from benchmarks.meshes import mesh
 from benchmarks.report import table
 from benchmarks.timing import in_turn

@@ -111,7 +111,7 @@ class SeenMesh(NamedTuple):
         arguments = self, hits.part, hits.depth, width, met
         parallel(silhouettes_loops.mark_silhouettes, len(self.counts), *arguments, work=5 * len(self.faces))
 
-    def join(self, hits: Hits, met: np.ndarray, colors: bool, joined: np.ndarray) -> None:
+    def join(self, hits: Hits, met: np.ndarray, joined: np.ndarray, *, colors: bool) -> None:
         """Mark, in `joined` (2, H, W), the centres whose hits, of one of the parts, a patch joins to the next ones'.
 
         `hits` (H, W), read-only, are seen at centres; for `met` see `mark_silhouettes`, for `colors` the loop `seams`.
@@ -121,7 +121,7 @@ class SeenMesh(NamedTuple):
 
     def spans(self, gaps: Gaps, seams: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spans of triangles on gaps, (N, 3) and (N, 6) or (N, 9), see `spans_loops.spans_of`; and their parts (N,)."""
-        size = len(self.counts), spans_loops.BLOCK
+        size = len(self.counts), silhouettes_loops.BLOCK
         triangles, most, counts = np.empty(size, np.int32), np.empty(size, np.int32), np.empty_like(self.counts)
         parallel(spans_loops.most_spans, len(counts), self, gaps, triangles, most, counts, work=5 * len(self.faces))
         listed = np.arange(size[1]) < counts[:, None]

@@ -36,8 +36,8 @@ def turns(first, last, mesh, height, width):
         width: likewise.
     """
     faces, seen, corners = mesh.faces, mesh.seen, np.empty((3, 4))
-    x, y, own = np.empty((3, BLOCK), np.float32), np.empty((3, BLOCK), np.float32), np.empty((4, BLOCK), np.int32)
-    sizes, lines, cells, order = own[0], own[1], own[2], own[3]
+    x, y, table = np.empty((3, BLOCK), np.float32), np.empty((3, BLOCK), np.float32), np.empty((4, BLOCK), np.int32)
+    sizes, lines, cells, order = table[0], table[1], table[2], table[3]
     for block in range(first, last):
         begin, end = block * BLOCK, min((block + 1) * BLOCK, len(faces))
         block_faces, sides, keep = faces[begin:end], mesh.sides[begin:end], mesh.keep[begin:end]
@@ -102,11 +102,11 @@ def mark_silhouettes(first, last, mesh, part, depth, width, gaps):
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         gaps: (2, H, W) uint8.
     """
-    adjacent, sides = mesh.adjacent, mesh.sides
+    adjacent, sides, on_lines = mesh.adjacent, mesh.sides, mesh.on_lines
     ends, deep, folds = np.empty((2, 2)), np.empty(2), np.empty(BLOCK, np.int32)
     for block in range(first, last):
-        count, on_lines = 0, mesh.on_lines[block * BLOCK :]
-        for n in range(mesh.counts[block]):
+        count, place = 0, block * BLOCK
+        for n in range(place, place + mesh.counts[block]):
             t = on_lines[n]
             side = sides[t]
             a, b, c = sides[adjacent[t, 0]] * side, sides[adjacent[t, 1]] * side, sides[adjacent[t, 2]] * side

@@ -34,7 +34,7 @@ def crossings_of_triangles(hits: Hits, meshes: Sequence[SeenMesh], width: np.nda
         mesh.mark_silhouettes(hits, width, met)
     joined = np.zeros(met.shape, np.bool_)
     for mesh in meshes:
-        mesh.join(hits, met, seams, joined)
+        mesh.join(hits, met, joined, colors=seams)
     marks, same = np.empty_like(joined), np.empty_like(joined)
     parallel(spans_loops.wanted, len(met[0]), hits.part[None], joined, met, marks, same, work=hits.part.size)
     gaps = Gaps.of(marks)

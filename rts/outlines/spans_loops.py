@@ -136,8 +136,8 @@ def most_spans(first, last, mesh, gaps, triangles, most, counts):
     marks, box, near = gaps.around.reshape(-1), np.empty(4, np.float32), np.empty((2, BLOCK), np.int32)
     height, width = gaps.rows.shape
     for block in range(first, last):
-        count, listed, place = 0, block * BLOCK, 0
-        for n in range(listed, listed + mesh.counts[block]):  # Without branches, as in `turns`.
+        count, begin, place = 0, block * BLOCK, 0
+        for n in range(begin, begin + mesh.counts[block]):  # Without branches, as in `turns`.
             size = abs(sides[on_lines[n]])
             # Sizes 4 and 5 share the last of the marks.
             axes = lines[n] & (marks[cells[n]] >> 2 * (min(size, 4) - 1) | (3 if size == ANY_SIZE else 0))

@@ -71,7 +71,7 @@ def _gaps_to_search(
         mesh.mark_silhouettes(ends, width, met)
     below = Hits(*(x.reshape(-1, size[1]) for x in layers))  # One layer after the other.
     for mesh in meshes:
-        mesh.join(below, met, True, joined)
+        mesh.join(below, met, joined, colors=True)
     marks, same = np.empty(met.shape, np.bool_), np.empty(met.shape, np.bool_)
     parallel(spans_loops.wanted, size[0], layers.part, joined, met, marks, same, work=2 * layers.part.size)
     return marks, same

@@ -197,22 +197,20 @@ def test_all_triangles_that_meet_a_line_of_centres_are_listed_and_few_others():
     corners[700:] = corners[700:, :1]  # Seen edge-on.
     mesh = of(corners.reshape(-1, 2), np.arange(2700).reshape(-1, 3))
     low, high = mesh.seen.reshape(-1, 3, 2).min(1), mesh.seen.reshape(-1, 3, 2).max(1)
-    # By lines of centres of the image, from 0 to 7: those along x are at y + 1/2.
-    for slack, least in ((2e-5, True), (0.02, False)):
+
+    def meets(slack):
+        """(T, 2), true for triangles that meet lines of centres of the image along x, or along y, or nearly."""
         first, last = np.maximum(np.ceil(low - 0.5 - slack), 0), np.minimum(np.floor(high - 0.5 + slack), 7)
-        meets = (first <= last)[:, ::-1] & (mesh.sides[:-1] != 0)[:, None]
-        lines = np.zeros(900, int)
-        triangles, own = listed(mesh)
-        lines[triangles] = own
-        for axis in range(2):
-            given = lines >> axis & 1 == 1
-            assert (given | ~meets[:, axis]).all() if least else (~given | meets[:, axis] | outside(low, high)).all()
+        return (first <= last)[:, ::-1] & (mesh.sides[:-1] != 0)[:, None]
+
+    triangles, lines = listed(mesh)
+    found = np.zeros((900, 2), bool)
+    found[triangles] = np.stack([lines & 1, lines >> 1], axis=1)
+    assert found[meets(2e-5)].all()
+    # Some that lie beyond the image, but not far, are listed, too.
+    beyond = ((high < 0.6) | (low > 7.4)).any(1, keepdims=True)
+    assert not found[~(meets(0.02) | beyond)].any()
     assert (np.diff(triangles) > 0).all() and 100 < len(triangles) < 600
-
-
-def outside(low, high):
-    """True for triangles that lie beyond the image, within two cells of it."""
-    return ((high < 0.6) | (low > 7.4)).any(1)
 
 
 def test_triangles_that_are_not_kept_are_not_listed():
@@ -250,7 +248,7 @@ def test_patches_join_the_centres_between_which_they_go_on():
     met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
     fronts = Hits(read_only(part), read_only(triangle), read_only(5.0 * np.ones(SIZE)))
     own.mark_silhouettes(fronts, np.array([1.0, 0.0]), met)
-    own.join(fronts, met, True, joined)
+    own.join(fronts, met, joined, colors=True)
     both = [(part >= 0) & (np.roll(part, -1, axis) >= 0) for axis in (1, 0)]
     np.testing.assert_array_equal(joined, both)
 
@@ -265,7 +263,7 @@ def test_patches_of_deeper_layers_are_walked_over_as_those_in_front():
         triangle, depth = (np.concatenate([x[k] for k in layers]) for x in (seen.triangle_ids, seen.depth))
         part = np.where(triangle >= 0, 0, -1).astype(np.int32)
         hits, found = Hits(*map(read_only, (part, triangle, np.float64(depth)))), np.zeros((2, *part.shape), bool)
-        own.join(hits, np.zeros((2, *SIZE), np.uint8), True, found)
+        own.join(hits, np.zeros((2, *SIZE), np.uint8), found, colors=True)
         return found
 
     both, front, back = joined([0, 1]), joined([0]), joined([1])
@@ -282,6 +280,6 @@ def test_patches_of_a_part_that_intersect_are_told_apart_by_colours_alone(colors
     fronts = Hits(*map(read_only, (np.zeros(SIZE, np.int32), np.where(right, 0, 1).astype(np.int32), np.ones(SIZE))))
     met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
     own.mark_silhouettes(fronts, np.array([1.0, 0.0]), met)
-    own.join(fronts, met, colors, joined)
+    own.join(fronts, met, joined, colors=colors)
     assert not met.any() and joined[1, :-1].all() and not joined[0, :, 7].any()
     np.testing.assert_array_equal(joined[0, :, :7].all(0), [True] * 3 + [not colors] + [True] * 3)
