@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ QUAD = np.array([[-0.62, -0.55, 0], [0.55, -0.5, 0], [0.6, 0.47, 0], [-0.58, 0.5
 
 SceneAt = Callable[[torch.Tensor], Sequence[rts.Part]]
 
-METHODS: dict[str, dict] = {
+METHODS: dict[str, dict[str, Any]] = {
     "multi": {"splatter": "multi", "layers": 2},
     "edges": {"splatter": "edges"},
 }
@@ -185,31 +186,37 @@ def low(x: np.ndarray) -> np.ndarray:
     return gaussian_filter(x, (2, 2, 0))
 
 
-def truth(scene: SceneAt, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+def truth(
+    scene: SceneAt, samples: int = SAMPLES, size: tuple[int, int] = SIZE
+) -> tuple[np.ndarray, np.ndarray]:
     """The area-sampled image, and the difference of two a pixel of motion."""
 
     def area(t: float) -> np.ndarray:
         options = {"splatter": "none", "layers": 1, "supersample": samples}
         with torch.no_grad():
-            return rts.render(scene(torch.tensor(t)), CAMERA, SIZE, **options).numpy()
+            return rts.render(scene(torch.tensor(t)), CAMERA, size, **options).numpy()
 
     return area(0.0), (area(HALF) - area(-HALF)) / (2 * HALF)
 
 
+def score(
+    scene: SceneAt, known: tuple[np.ndarray, np.ndarray], size: tuple[int, int] = SIZE, **options: Any
+) -> tuple[float, float, float, float]:
+    """Errors in each pixel and low-passed, gain, and error of the image, beside a `truth` that is known."""
+    (area, true), norm = known, np.linalg.norm
+    image, own = derivative(lambda t: rts.render(scene(t), CAMERA, size, **options))
+    return (
+        norm(own - true) / norm(true),
+        norm(low(own - true)) / norm(low(true)),
+        float((low(own) * low(true)).sum() / (low(true) ** 2).sum()),
+        float(np.sqrt(((image - area) ** 2).mean())),
+    )
+
+
 def scores(scene: SceneAt) -> dict[str, tuple[float, float, float, float]]:
     """Errors in each pixel and low-passed, gain, and error of the image, by method."""
-    area, true = truth(scene)
-    found = {}
-    for name, options in METHODS.items():
-        image, own = derivative(lambda t, o=options: rts.render(scene(t), CAMERA, SIZE, **o))
-        norm = np.linalg.norm
-        found[name] = (
-            norm(own - true) / norm(true),
-            norm(low(own - true)) / norm(low(true)),
-            float((low(own) * low(true)).sum() / (low(true) ** 2).sum()),
-            float(np.sqrt(((image - area) ** 2).mean())),
-        )
-    return found
+    known = truth(scene)
+    return {name: score(scene, known, **options) for name, options in METHODS.items()}
 
 
 def main() -> None:

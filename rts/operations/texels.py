@@ -1,4 +1,9 @@
-"""Bilinear lookups in tables of texels, of one image or of several, one after the other."""
+"""Bilinear lookups in tables of texels, of one image or of several, one after the other, at points or over footprints.
+
+The mean M of an image over a parallelogram with the sides a and b changes along a by the difference of its means over
+the two sides along b, and likewise along b: so ∇M · a and ∇M · b are known without the image's own slopes, which of
+texels smaller than the footprint say nothing of M.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.operation import Operation
@@ -23,8 +28,13 @@ def texels(
     image: Array | None = None,
     wrap: tuple[str, str] = ("repeat", "repeat"),
     filter: str = "linear",
+    footprint: Array | None = None,
 ) -> Array:
     """Bilinear lookups (N, C), differentiable in the table and in uv.
+
+    Over a footprint they are the mean of lookups at one place along a side of up to half a texel, at two along one of
+    up to five texels, and at four along longer ones. The derivative in uv is that of the footprint's mean, by as many
+    lookups along each of its sides; where a side has one lookup, by the mean of the slopes there.
 
     Args:
         table: (M, C) float, the texels of all images, row by row, the uppermost first.
@@ -33,26 +43,99 @@ def texels(
         image: (N,) integers, which image each lookup is of, from 0 on; None for the first.
         wrap: continuations outside [0, 1] along u and v: "repeat" or "mirror"; any other text is "clamp".
         filter: "nearest" takes the texel around a point, without derivative in uv; "linear" does not.
+        footprint: (N, 4) float, the sides of the parallelogram around each place, in u and v: (∂u/∂x, ∂v/∂x, ∂u/∂y,
+            ∂v/∂y); constant. None for points. One that is infinite or NaN is a point.
     """
     xp = namespace(table, uv)
     if not xp.isdtype(uv.dtype, "real floating"):
         uv = xp.astype(uv, table.dtype)
     number = uv[:0, 0] if image is None else image
-    return TEXELS(table, uv, xp.astype(number, xp.int32), sizes=tuple(sizes), wrap=wrap, filter=filter)
+    over = stopped(uv[:0, :]) if footprint is None else xp.astype(footprint, uv.dtype, copy=False)
+    options: dict[str, Any] = {"sizes": tuple(sizes), "wrap": wrap, "filter": filter}
+    return TEXELS(table, uv, xp.astype(number, xp.int32), over, **options)
 
 
 def _specification(
-    table: Array, uv: Array, image: Array, *, sizes: tuple[tuple[int, ...], ...], wrap: tuple[str, str], filter: str
+    table: Array,
+    uv: Array,
+    image: Array,
+    footprint: Array,
+    *,
+    sizes: tuple[tuple[int, ...], ...],
+    wrap: tuple[str, str],
+    filter: str,
 ) -> Array:
-    xp = namespace(table, uv)
-    if image.shape[0]:
-        from rts.operations.texels_loops import places_of
+    xp, options = namespace(table, uv), {"sizes": sizes, "wrap": wrap, "filter": filter}
+    if not footprint.shape[0]:
+        return _points(table, uv, image, **options)[0]
+    from rts.operations.texels_loops import FAR, NARROW, SHEARED, WIDE
 
-        of_rows = xp.take(engine_of(table, uv).constant(places_of(sizes), uv), image, axis=0)
-        height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
-        step, first = of_rows[:, 1], of_rows[:, 2]
-    else:
-        height, width, step, first = *sizes[0], sizes[0][1], 0
+    still, height, width = stopped(uv), *_places(uv, image, sizes)[:2]
+    sides = xp.stack([footprint[:, :2], footprint[:, 2:]])
+    # In texels, right and down.
+    long = xp.stack([sides[..., 0] * width, -sides[..., 1] * height], axis=-1)
+    lengths = xp.sqrt(xp.sum(long * long, axis=-1))
+    known = lengths[0, :] + lengths[1, :] < FAR
+    sides, long, lengths = (xp.where(xp.reshape(known, (-1,) + (1,) * (x.ndim - 2)), x, 0.0) for x in (sides, long, lengths))
+    counts = xp.where(lengths <= NARROW, 1.0, xp.where(lengths <= WIDE, 2.0, 4.0))
+
+    def looked_up(places: list[tuple[Any, Any]], shares: list[Array]) -> tuple[Array, Array, Array]:
+        """Sums of lookups, at places along both sides, times shares; and those of slopes right and down."""
+        at = xp.concat([still + a[:, None] * sides[0, ...] + b[:, None] * sides[1, ...] for a, b in places])
+        share, number = xp.concat(shares)[:, None], xp.concat([image] * len(places))
+        found = _points(table, at, number, **options)
+        return tuple(xp.sum(xp.reshape(share * x, (len(places), *still.shape[:1], -1)), axis=0) for x in found)
+
+    zero, numbers = xp.zeros_like(still[:, 0]), range(4)
+    along = [[xp.where(i < n, (i + 0.5) / n - 0.5, zero) for i in numbers] for n in (counts[0, :], counts[1, :])]
+    share = [[xp.where(i < n, 1 / n, zero) for i in numbers] for n in (counts[0, :], counts[1, :])]
+    inside = [(a, b, s * t) for a, s in zip(along[0], share[0], strict=True) for b, t in zip(along[1], share[1], strict=True)]
+    mean, right, down = looked_up([(a, b) for a, b, _ in inside], [s for *_, s in inside])
+    if filter == "nearest":
+        return mean
+    ends = [(sign / 2 + zero, sign) for sign in (-1, 1)]
+    rise_a = looked_up([(end, b) for end, _ in ends for b in along[1]], [sign * t for _, sign in ends for t in share[1]])
+    rise_b = looked_up([(a, end) for end, _ in ends for a in along[0]], [sign * s for _, sign in ends for s in share[0]])
+    (ax, ay), (bx, by) = ((side[:, 0:1], side[:, 1:2]) for side in (long[0, ...], long[1, ...]))
+    more_a, more_b = rise_a[0] - right * ax - down * ay, rise_b[0] - right * bx - down * by
+    determinant, (square_a, square_b) = ax * by - ay * bx, (lengths * lengths)[..., None]
+    wide_a, wide_b = (counts > 1)[..., None]
+    both = wide_a & wide_b & (determinant * determinant > SHEARED * square_a * square_b)
+    of_a = wide_a & (both | (square_a >= square_b))
+    of_b = wide_b & (both | (square_a < square_b))
+    by_a, by_b = (xp.where(x, y, 1.0) for x, y in ((of_a, xp.where(both, determinant, square_a)), (of_b, xp.where(both, determinant, square_b))))
+    more_a, more_b = xp.where(of_a, more_a / by_a, 0.0), xp.where(of_b, more_b / by_b, 0.0)
+    right = right + more_a * xp.where(both, by, ax) + more_b * xp.where(both, -ay, bx)
+    down = down + more_a * xp.where(both, -bx, ay) + more_b * xp.where(both, ax, by)
+    moved = uv - still
+    return mean + right * (moved[:, :1] * width[:, None]) - down * (moved[:, 1:] * height[:, None])
+
+
+def _places(uv: Array, image: Array, sizes: tuple[tuple[int, ...], ...]) -> tuple[Array, Array, Any, Any]:
+    """Height, width, texels from row to row, and the first texel of the image of each lookup (N,)."""
+    xp = namespace(uv)
+    if not image.shape[0]:
+        one = xp.ones_like(stopped(uv[:, 0]))
+        return one * sizes[0][0], one * sizes[0][1], sizes[0][1], 0
+    from rts.operations.texels_loops import places_of
+
+    of_rows = xp.take(engine_of(uv).constant(places_of(sizes), uv), image, axis=0)
+    height, width = (xp.astype(of_rows[:, i], uv.dtype) for i in range(2))
+    return height, width, of_rows[:, 1], of_rows[:, 2]
+
+
+def _points(
+    table: Array,
+    uv: Array,
+    image: Array,
+    *,
+    sizes: tuple[tuple[int, ...], ...],
+    wrap: tuple[str, str],
+    filter: str,
+) -> tuple[Array, Array, Array]:
+    """Lookups (N, C) at points, and the slopes there, to the right and down, a texel each."""
+    xp = namespace(table, uv)
+    height, width, step, first = _places(uv, image, sizes)
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     if filter == "nearest":
         x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
@@ -63,8 +146,9 @@ def _specification(
     )
     index = xp.concat([rows[dy] * step + columns[dx] + first for dy, dx in CORNERS])
     found = xp.reshape(xp.take(table, index, axis=0), (4, -1, table.shape[1]))
-    upper, lower = (found[i, ...] + fx * (found[i + 1, ...] - found[i, ...]) for i in (0, 2))
-    return upper + fy * (lower - upper)
+    rises = [found[i + 1, ...] - found[i, ...] for i in (0, 2)]
+    upper, lower = (found[i, ...] + fx * rise for i, rise in zip((0, 2), rises, strict=True))
+    return upper + fy * (lower - upper), rises[0] + fy * (rises[1] - rises[0]), lower - upper
 
 
 def _wrapped(index: Array, count: Any, wrap: str) -> Array:
@@ -86,13 +170,20 @@ def _shape(table: tuple[int, ...], uv: tuple[int, ...], *_: tuple[int, ...], **_
 
 
 def _check(
-    table: np.ndarray, uv: np.ndarray, image: np.ndarray, *, sizes: tuple[tuple[int, ...], ...], **_: object
+    table: np.ndarray,
+    uv: np.ndarray,
+    image: np.ndarray,
+    footprint: np.ndarray,
+    *,
+    sizes: tuple[tuple[int, ...], ...],
+    **_: object,
 ) -> None:
-    if uv.shape[1] != 2 or 0 < len(image) < len(uv) or sum(h * w for h, w in sizes) > len(table):
-        shapes = ", ".join(str(x.shape) for x in (table, uv, image))
+    few = 0 < len(image) < len(uv) or (len(footprint) and (len(footprint) < len(uv) or footprint.shape[1] != 4))
+    if uv.shape[1] != 2 or few or sum(h * w for h, w in sizes) > len(table):
+        shapes = ", ".join(str(x.shape) for x in (table, uv, image, footprint))
         raise InputError(
-            f"table, uv and image have shapes {shapes}, for images of sizes {sizes}; expected (M, C), with a row for "
-            f"each texel, (N, 2), (N,)"
+            f"table, uv, image and footprint have shapes {shapes}, for images of sizes {sizes}; expected (M, C), with "
+            f"a row for each texel, (N, 2), (N,), (N, 4)"
         )
     if image.size and not 0 <= image.min() <= image.max() < len(sizes):
         raise InputError(f"images from {image.min()} to {image.max()} were asked for, of {len(sizes)}")
@@ -105,8 +196,9 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 
 
 TEXELS = Operation.of_loops(
-    "rts.texels", _specification, (2, 2, 1), _shape, _loops, _check, differentiable=2, packed=(1,), packed_result=True
+    "rts.texels", _specification, (2, 2, 1, 2), _shape, _loops, _check, differentiable=2, packed=(1,), packed_result=True
 )
-"""The operation of `texels`, on table (M, C), uv (N, 2), and numbers of images (N,), or (0,) where all are the first.
+"""The operation of `texels`, on table (M, C), uv (N, 2), numbers of images (N,), or (0,) where all are the first, and
+footprints (N, 4), or (0, ·) for points.
 
 Parameters: `sizes`, `wrap` and `filter`, as there."""

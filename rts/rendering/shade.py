@@ -60,9 +60,7 @@ def _checked(gbuffer: GBuffer, part: CheckedPart, samples: Samples) -> GBuffer:
 
 def shaded_at_once(part: CheckedPart) -> bool:
     """True if a part's shader takes the samples of several views in one call, or gives one colour."""
-    # The footprint of a sample depends on the camera of its view.
-    needs_no_footprint = part.reads is not None and FOOTPRINT not in part.reads
-    return part.uniform or (part.takes_views and needs_no_footprint)
+    return part.uniform or part.takes_views
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
@@ -72,19 +70,14 @@ def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
 
 
 def add_footprint(
-    part: CheckedPart,
-    samples: Samples,
-    local: GBuffer,
-    camera: Camera,
-    grid: tuple[int, int],
-    context: Context,
+    part: CheckedPart, samples: Samples, local: GBuffer, rows: Array, context: Context, view: Array | None = None
 ) -> None:
-    """Add a deferred "uv_footprint" to the G-buffer `local` of samples in one view, if it has "uv" but no footprint.
+    """Add a deferred "uv_footprint" to the G-buffer `local` of samples, if it has "uv" but no footprint.
 
-    Arguments are as in `uv_footprint`; `camera` is its camera.
+    Samples of another number of parameters than two have none. Other arguments are as in `uv_footprint`.
     """
-    if "uv" in local and FOOTPRINT not in local:
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, camera, grid, *context))
+    if "uv" in local and FOOTPRINT not in local and samples.params.shape[-1] == 2:
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, rows, view, *context))
 
 
 def shade(

@@ -42,12 +42,13 @@ def to_splats(sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, gr
         local_camera = grid.cameras[index]
         if not engine.owns(local_camera.view):  # The context's engine is that of the background, or of a shader.
             local_camera = local_camera.replace(view=inputs.constants(local_camera.view))
-        add_footprint(part, samples, local, local_camera, grid.size, inputs)
+        rows = local_camera.pixel_rows(grid.size)
+        add_footprint(part, samples, local, rows, inputs)
         padded = sampled.stencil is not None and engine.padded(samples.row) and not _has_own_rows(samples)
         used = all_in_use(samples, inputs, sampled.stencil, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
         position = local["position"] if samples.centered else on_rays(samples, local["position"])
-        placed = projective_map(local_camera.pixel_rows(grid.size), position)
+        placed = projective_map(rows, position)
         positions.append(context.constants(placed))
         check_splats(index, part, world, positions[-1], rgba, sampled.row, first)
         colors.append(context.constants(rgba))

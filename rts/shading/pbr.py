@@ -55,7 +55,7 @@ class Pbr(Unlit):
 
     samplers: tuple[tuple[str, Wrap, str], ...] = ()
     takes_views = True
-    reads = "normal", "face_normal", "color", "uv", "texture", "light", TANGENT, *MAPS, *map(own_uv, MAPS)
+    reads = "normal", "face_normal", "color", "uv", "texture", FOOTPRINT, "light", TANGENT, *MAPS, *map(own_uv, MAPS)
 
     def __post_init__(self):
         super().__post_init__()
@@ -125,9 +125,9 @@ class Pbr(Unlit):
             raise InputError(f"theta[{name!r}] {described(theta[name])}; expected a map (h, w, {channels})")
         _, wrap, filter = next((one for one in self.samplers if one[0] == name), (name, self.wrap, self.filter))
         own = own_uv(name) if own_uv(name) in gbuffer else None
-        footprint = gbuffer[FOOTPRINT] if self.mip and own is None else None
+        footprint = self.footprint(gbuffer, filter) if own is None else None
         if own is not None and shape_of(gbuffer[own])[1:] != (2,):
             raise InputError(f"the surface's {own!r} {described(gbuffer[own])}; expected (N, 2), coordinates of a map")
-        values = sample_texture(theta[name], gbuffer[own or "uv"], wrap, footprint, filter)
+        values = sample_texture(theta[name], gbuffer[own or "uv"], wrap, footprint, filter, self.mip)
         check_base(f"theta[{name!r}]", values)
         return values

@@ -3,8 +3,8 @@
 A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of θ that it reads are differentiable:
 
     "color" (3,) or (4,)             a factor of the base colour
-    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
-                                     over gbuffer["uv_footprint"] by shaders with `mip=True`
+    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up, and
+                                     averaged over gbuffer["uv_footprint"], if it is there
     "light"                          see `rts.shading.light`
     "specular" () or (3,)            of `blinn_phong`: the highlight's strength, by default 0.3
     "shininess" ()                   of `blinn_phong`: its exponent, by default 32
@@ -27,7 +27,6 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
 from rts.operations.unit import unit
-from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.light import light_of
@@ -96,9 +95,10 @@ class Unlit(Shader):
     Attributes:
         wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp", or a pair, along u and along v.
         opaque: whether to ignore the alpha of texture and colours.
-        mip: whether to average the texture over roughly the footprint of a sample, trilinearly in a pyramid (mipmaps),
-            so that texels smaller than samples do not alias. The footprint has no derivative.
-        filter: "linear" between the centres of texels, or "nearest", for textures of plain squares.
+        mip: whether to average over footprints of many texels in a pyramid (mipmaps), so that texels much smaller than
+            pixels do not alias. Without it, the mean is one of at most 4 × 4 lookups.
+        filter: "linear" between the centres of texels, or "nearest", for textures of plain squares; "nearest" averages
+            with `mip` alone.
     """
 
     wrap: Wrap = "repeat"
@@ -106,13 +106,10 @@ class Unlit(Shader):
     mip: bool = False
     filter: str = "linear"
     takes_views = True
-    reads = ("color", "uv", "texture")
+    reads = ("color", "uv", "texture", FOOTPRINT)
 
     def __post_init__(self):
         check_sampler(self.wrap, self.filter)
-        reads = promised(self, "reads")
-        if self.mip and reads is not None:
-            object.__setattr__(self, "reads", (*reads, FOOTPRINT))
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -158,8 +155,21 @@ class Unlit(Shader):
 
     def looked_up(self, texture: Array, gbuffer: GBuffer) -> Array:
         """A texture (h, w, C) at the samples (N, C), with the options of this shader."""
-        footprint = gbuffer[FOOTPRINT] if self.mip else None
-        return sample_texture(texture, gbuffer["uv"], self.wrap, footprint, self.filter)
+        return sample_texture(
+            texture, gbuffer["uv"], self.wrap, self.footprint(gbuffer, self.filter), self.filter, self.mip
+        )
+
+    def footprint(self, gbuffer: GBuffer, filter: str) -> Array | None:
+        """What textures are averaged over (N, 4), or None where they are read at points.
+
+        Raises:
+            InputError: `mip` is asked for on a surface without footprints.
+        """
+        if self.mip and FOOTPRINT not in gbuffer:
+            raise InputError(
+                f"mipmaps need {FOOTPRINT!r}, which surfaces of two parameters a sample have; leave out mip=True"
+            )
+        return gbuffer[FOOTPRINT] if FOOTPRINT in gbuffer and (self.mip or filter != "nearest") else None
 
     def premultiplied(self, color: Array, alpha: Array) -> Array:
         """Premultiplied (N, 4) of colour (N, 3) and alpha (N, 1); an opaque shader takes 1 for alpha."""
@@ -171,7 +181,7 @@ class Textured(Unlit):
     """`Unlit` whose base colour must come from a texture; θ without one, or a surface without uv, is refused."""
 
     takes_views = True
-    reads = ("uv", "texture", "color")
+    reads = ("uv", "texture", "color", FOOTPRINT)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -186,7 +196,7 @@ class Lambert(Unlit):
     """Diffuse shading, two-sided: normals are those of the side that is seen."""
 
     takes_views = True
-    reads = ("normal", "face_normal", "color", "uv", "texture", "light")
+    reads = ("normal", "face_normal", "color", "uv", "texture", FOOTPRINT, "light")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -206,7 +216,7 @@ class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
     takes_views = True
-    reads = ("normal", "face_normal", "color", "uv", "texture", "light", "specular", "shininess")
+    reads = ("normal", "face_normal", "color", "uv", "texture", FOOTPRINT, "light", "specular", "shininess")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""

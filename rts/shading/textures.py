@@ -1,4 +1,4 @@
-"""Textures: bilinear lookup, and anisotropic trilinear lookup in a pyramid of averages (mipmaps)."""
+"""Textures: bilinear lookup, at points or over footprints, and trilinear lookup in a pyramid of averages (mipmaps)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, shape_of
-from rts.arrays.engines import engine_of, namespace, stopped, value_of
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.texels import texels
@@ -15,8 +15,8 @@ WRAPS = ("repeat", "mirror", "clamp")
 """Continuations of a texture outside [0, 1]."""
 FILTERS = ("linear", "nearest")
 """Ways to read between the centres of texels."""
-TAPS = (4, 2, 1)
-"""Numbers of lookups along the longer axis of a footprint."""
+TEXELS = 2.5
+"""How many texels of its level in the pyramid a footprint is wide, along its shorter axis."""
 MAPS = ("metallic", "roughness", "normal_map", "occlusion", "emissive", "specular")
 """Entries of θ that may be maps, beside the texture."""
 Wrap = str | tuple[str, str]
@@ -38,7 +38,12 @@ def check_sampler(wrap: object, filter: object) -> None:
 
 
 def sample_texture(
-    texture: Array, uv: Array, wrap: Wrap = "repeat", footprint: Array | None = None, filter: str = "linear"
+    texture: Array,
+    uv: Array,
+    wrap: Wrap = "repeat",
+    footprint: Array | None = None,
+    filter: str = "linear",
+    mip: bool = False,
 ) -> Array:
     """Bilinear texture lookup, or the mean over a footprint where one is given; differentiable in texture and uv.
 
@@ -48,8 +53,10 @@ def sample_texture(
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
         wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp". A pair is for u and for v.
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
-            over roughly this area, by up to four trilinear lookups; see `taps_of`. None for no average.
+            over this area, by up to four lookups along each side, and its derivative in uv is that of the mean (see
+            `rts.operations.texels`). None for points.
         filter: "nearest" takes the texel around a point, without derivative in uv; any other text is "linear".
+        mip: whether footprints that are wide are averaged in a pyramid of averages, trilinearly; see `level_of`.
 
     Returns:
         (N, C).
@@ -69,41 +76,20 @@ def sample_texture(
         )
     height, width, channels = shape
     wrap = (wrap, wrap) if isinstance(wrap, str) else wrap
-    if footprint is None:
-        return texels(xp.reshape(texture, (height * width, channels)), uv, [(height, width)], None, wrap, filter)
-    levels, engine = mip_levels(texture), engine_of(texture, uv)
+    if footprint is None or not mip:
+        table = xp.reshape(texture, (height * width, channels))
+        return texels(table, uv, [(height, width)], None, wrap, filter, footprint)
+    levels = mip_levels(texture)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
+    level = level_of(footprint, (height, width))
+    finer = xp.clip(xp.floor(level), 0, max(len(levels) - 2, 0))
+    coarser = xp.clip(finer + 1, 0, len(levels) - 1)
+    # One lookup of both: engines make an array as large as the table for the gradient of each.
+    number = xp.astype(xp.concat([finer, coarser]), xp.int32)
     sizes = [shape_of(x)[:2] for x in levels]
-
-    def averaged(uv: Array, level: Array, step: Array, count: Array, most: int) -> Array:
-        """The mean of each row's taps, of which there are at most `most`."""
-        finer = xp.clip(xp.floor(level), 0, max(len(levels) - 2, 0))
-        # One lookup of all: engines make an array as large as the table for the gradient of each.
-        place = xp.concat([uv + (i - 0.5 * (count - 1))[:, None] * step for i in range(most)] * 2)
-        finer, coarser = (xp.astype(x, xp.int32) for x in (finer, xp.clip(finer + 1, 0, len(levels) - 1)))
-        number = xp.concat([finer] * most + [coarser] * most)
-        tap = xp.reshape(texels(table, place, sizes, number, wrap, filter), (2, most, -1, channels))
-        tap = tap[0, ...] + (level - xp.astype(finer, level.dtype))[:, None] * (tap[1, ...] - tap[0, ...])
-        if most == 1:
-            return tap[0, ...]
-        return sum(xp.where(i < count, 1 / count, 0 * count)[:, None] * tap[i, ...] for i in range(most))
-
-    rows = uv, *taps_of(footprint, (height, width))
-    known = value_of(rows[-1])
-    if known is None or known.ndim != 1:
-        return averaged(*rows, TAPS[0])
-    # Rows of as many taps together, so that only those pay for taps that need them.
-    order, found, start = np.argsort(-known.astype(np.int8), kind="stable"), [], 0
-    for most in TAPS:
-        end = min(engine.room(int((known >= most).sum()), uv), len(known))
-        if end == len(known) and start == 0:
-            return averaged(*rows, most)
-        if end > start:
-            here = engine.constant(order[start:end], uv)
-            a, b, c, d = (xp.take(x, here, axis=0) for x in rows)
-            found.append(averaged(a, b, c, d, most))
-            start = end
-    return xp.take(xp.concat(found), engine.constant(np.argsort(order), uv), axis=0)
+    found = texels(table, xp.concat([uv, uv]), sizes, number, wrap, filter, xp.concat([footprint, footprint]))
+    found = xp.reshape(found, (2, -1, channels))
+    return found[0, ...] + (level - finer)[:, None] * (found[1, ...] - found[0, ...])
 
 
 def mip_levels(texture: Array) -> list[Array]:
@@ -120,21 +106,15 @@ def mip_levels(texture: Array) -> list[Array]:
     return levels
 
 
-def taps_of(footprint: Array, size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Lookups whose mean is that of the texture over footprints, without derivative.
+def level_of(footprint: Array, size: tuple[int, int]) -> Array:
+    """The levels (N,) of `mip_levels` to average footprints in, real numbers, without derivative.
 
-    A footprint is taken for an ellipse. One that is nearly round has one tap. Others have two or four, side by side
-    along the longer axis. Taps and the level together spread as widely as the footprint, in both axes: their variances
-    are the same. A level l with bilinear lookup has (4ˡ − 1) / 4 texels² more than level 0 has, a footprint of side s
-    has s² / 12.
+    0 is the texture itself, the last a single texel. A footprint is 2.5 of a level's texels along its shorter axis, if
+    it has at most five along the longer one: the mean of two lookups a side then spreads as widely as the footprint.
 
     Args:
         footprint: (N, 4), see `sample_texture`.
         size: (height, width) of the texture.
-
-    Returns:
-        The levels (N,) of `mip_levels`, real numbers: 0 is the texture itself, the last a single texel. Steps (N, 2) of
-        uv from tap to tap. The numbers (N,) of taps: 1, 2 or 4.
     """
     xp, (height, width), f = namespace(footprint), size, stopped(footprint)
     coarsest = max(height, width).bit_length() - 1
@@ -143,17 +123,10 @@ def taps_of(footprint: Array, size: tuple[int, int]) -> tuple[Array, Array, Arra
     square_u, product, square_v = (xp.sum(x, axis=1) for x in (u * u, u * v, v * v))
     middle, half = 0.5 * (square_u + square_v), 0.5 * (square_u - square_v)
     radius = xp.sqrt(half * half + product * product)
-    # 4ˡ of levels as wide as the longer and the shorter axis.
-    longer, shorter = 1 + (middle + radius) / 3, 1 + xp.clip(middle - radius, 0.0, None) / 3
-    one = xp.ones_like(middle)
-    count = xp.where(longer > 8 * shorter, 4 * one, xp.where(longer > 2 * shorter, 2 * one, one))
-    level = xp.where(count > 1, xp.maximum(shorter, longer / (count * count)), longer)
-    apart = xp.sqrt(3 * (longer - level) / xp.where(count > 1, count * count - 1, one))
-    along_u, along_v = xp.where(half > 0, radius + half, product), xp.where(half > 0, product, radius - half)
-    length = xp.sqrt(along_u * along_u + along_v * along_v)
-    apart = apart / xp.where(length > 0, length, one)
-    level = xp.clip(0.5 * xp.log2(level), 0.0, float(coarsest))
-    return level, xp.stack([apart * along_u / width, apart * along_v / height], axis=1), count
+    # The squares of the longer and of the shorter axis.
+    longer, shorter = middle + radius, xp.clip(middle - radius, 0.0, None)
+    texel = xp.maximum(xp.maximum(shorter / TEXELS**2, longer / (2 * TEXELS) ** 2), xp.ones_like(middle))
+    return xp.clip(0.5 * xp.log2(texel), 0.0, float(coarsest))
 
 
 def _halved(x: Array) -> Array:

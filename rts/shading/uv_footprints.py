@@ -10,8 +10,7 @@ from rts.arrays.engines import constants, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
-from rts.operations.linear import affine_map
-from rts.scene.camera import Camera
+from rts.operations.linear import affine_map, affine_map_of_views
 from rts.shading.parameter_steps import check_two_parameters, steps_beside
 
 FOOTPRINT = "uv_footprint"
@@ -25,8 +24,8 @@ def uv_footprint(
     theta: Mapping[str, Tree],
     samples: Samples,
     gbuffer: Mapping[str, Array],
-    camera: Camera,
-    grid: tuple[int, int],
+    rows: Array,
+    view: Array | None,
     engine: Engine,
     like: Array | None,
 ) -> Array:
@@ -41,8 +40,9 @@ def uv_footprint(
         theta: the entries that the surface reads.
         samples: the samples.
         gbuffer: "position" (N, 3), local space, and "uv" (N, 2) of the samples.
-        camera: the camera of the grid, in the surface's local space.
-        grid: (height, width) of the grid of cells.
+        rows: (R, 4), R at least 3, `Camera.pixel_rows` of the grid of cells, by the camera in the surface's local
+            space; or (B, R, 4), those of several views.
+        view: (N,) int32, the view of each sample; see `rts.operations.by_view`. None for one view.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants.
 
@@ -50,15 +50,17 @@ def uv_footprint(
         InputError: samples have another number of parameters than two.
     """
     check_two_parameters(surface, samples, FOOTPRINT, "mipmaps")
-    arrays = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
-    theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in arrays)
-    xp = namespace(position)
-    rows = camera.pixel_rows(grid)[:3, :]
-    pixel = affine_map(rows, position)
-    linear = xp.concat([rows[:, :3], xp.zeros_like(rows[:, 3:])], axis=1)
-    moves, changes = [], []
+    arrays = theta, rows, gbuffer["position"], gbuffer["uv"], samples.params
+    theta, rows, position, uv, params = (stopped(constants(x, engine, like)) for x in arrays)
+    xp, rows = namespace(position), rows[..., :3, :]
+    linear = xp.concat([rows[..., :3], xp.zeros_like(rows[..., 3:])], axis=-1)
+
+    def mapped(rows: Array, points: Array) -> Array:
+        return affine_map(rows, points) if view is None else affine_map_of_views(rows, points, view)
+
+    pixel, moves, changes = mapped(rows, position), [], []
     for moved, change in steps_beside(surface, theta, replace(samples, params=params), position, uv):
-        offset = affine_map(linear, moved)
+        offset = mapped(linear, moved)
         # The derivative of (p₀, p₁) / p₂.
         moves.append((offset[:, :2] * pixel[:, 2:3] - pixel[:, :2] * offset[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
         changes.append(change)

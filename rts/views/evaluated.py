@@ -15,9 +15,10 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.shader import Shader
-from rts.rendering.shade import evaluate, split_by_view
+from rts.rendering.shade import add_footprint, evaluate, split_by_view
 from rts.rendering.splats import concatenated
 from rts.shading.tangents import OWN_UV, TANGENT
+from rts.shading.uv_footprints import FOOTPRINT
 
 
 class Evaluated(NamedTuple):
@@ -73,6 +74,22 @@ class Evaluated(NamedTuple):
     def one(self) -> bool:
         """True if all views have the same transform, or none."""
         return all(transform is self.transforms[0] for transform in self.transforms)
+
+    def add_footprints(
+        self, parts: Sequence[CheckedPart | None], samples: Samples, rows: Array, view: Array, inputs: Context
+    ) -> None:
+        """Add deferred footprints of uv to `gbuffer`; arguments are as in `of`, and `rts.shading.uv_footprints`."""
+        if self.pieces is None:
+            assert self.part is not None
+            add_footprint(self.part, samples, self.gbuffer, rows, inputs, view)
+            return
+        of_views = []
+        for b, (part, (of_view, local)) in enumerate(zip(parts, self.pieces, strict=True)):
+            if part is not None and of_view.ids.shape[0]:
+                add_footprint(part, of_view, local, rows[b, ...], inputs)
+                of_views.append(local)
+        if all(FOOTPRINT in local for local in of_views) and FOOTPRINT not in self.gbuffer:
+            self.gbuffer.defer(FOOTPRINT, lambda: concatenated([local[FOOTPRINT] for local in of_views])[0])
 
     def split(self, samples: Samples, counts: np.ndarray, engine: Engine) -> list[tuple[Samples, GBuffer]]:
         """The samples and the G-buffer of each view."""

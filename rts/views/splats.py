@@ -107,6 +107,7 @@ def _positions_and_colors(
     cameras = context.constants(cameras)
     part = shown.part
     if part is not None and shaded_at_once(part):
+        shown.add_footprints(parts, whole, rows, view, inputs)
         camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
         moved = shown.transforms[0] if shown.one else ViewTransforms.of(shown.transforms, view)
         rgba = shade(part, theta_of(part, inputs), moved, used, shown.gbuffer, camera, engine)[1]
@@ -115,7 +116,7 @@ def _positions_and_colors(
 
         def colored(view: tuple) -> Array:
             seen, transform, grid_camera, camera, (samples, local) = view
-            add_footprint(seen, samples, local, grid_camera, size, inputs)
+            add_footprint(seen, samples, local, grid_camera.pixel_rows(size), inputs)
             theta = theta_of(seen, inputs)
             return context.constants(shade(seen, theta, transform, samples, local, camera, engine)[1])
 
