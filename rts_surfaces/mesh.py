@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from rts import GBuffer, InputError, Part, TriangleSurface, engine_of
 from rts.plugin_api.arrays import Array, Tree, exemplar
 from rts.plugin_api.checks import fingerprint, index_table, quoted
-from rts.plugin_api.operations import interpolate, take, with_room
+from rts.plugin_api.operations import differences, interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces import smooth_normals as smooth
@@ -171,7 +171,14 @@ class Mesh(TriangleSurface):
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
             gbuffer.defer("normal", partial(self._smooth_normals, vertices, samples))
+        if "uv" in theta:
+            gbuffer.defer("uv_steps", partial(self._steps, vertices, theta["uv"], samples))
         return gbuffer
+
+    def _steps(self, vertices: Array, uv: Array, samples: Samples) -> Array:
+        """How position and uv change along both parameters (N, 10), constant."""
+        steps = [differences(rows, samples.ids, self._columns.get(n, 0)) for n, rows in (("", vertices), ("uv", uv))]
+        return engine_of(*steps).namespace.concat(steps, axis=1)
 
     def attribute(self, name: str, rows: Array, samples: Samples) -> Array:
         """An attribute (N, C) at samples, interpolated between `rows` (A, C) of θ[name]."""

@@ -23,8 +23,7 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour, through any camera. It may depend on θ.
         takes_views: a promise that one call may take samples of several views, as `rts.render_views` then does:
-            `camera` is a `RowCameras`, whose methods give a row for each sample. Such a shader also declares `reads`,
-            without "uv_footprint".
+            `camera` is a `RowCameras`, whose methods give a row for each sample. Such a shader also declares `reads`.
         reads: a promise to need no entries but these, of θ and, besides "position", of the G-buffer; None for all.
             Samples then carry no others. Rendering warns of an unread entry of θ whose name is almost that of a read
             one. `rts.explain` lists all entries of θ that neither surface nor shader reads.

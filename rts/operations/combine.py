@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from rts.arrays.array_functions import described, from_numbers, shape_of
-from rts.arrays.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.engines import constants, engine_of, exemplar, namespace, stopped
 from rts.arrays.trees import Array
+from rts.compiling.threads import read_only
 from rts.errors import InputError
-from rts.operations.operation import Operation
+from rts.operations.operation import Operation, known_value
 from rts.operations.take import take
 
 
@@ -64,6 +65,26 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
             f"expected (N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
         )
     return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)
+
+
+def differences(rows: Array, ids: Array, column: int) -> Array:
+    """How `interpolate` changes along its two weights (N, 2 C): a − c and b − c; constant.
+
+    Args:
+        rows: (V, C) float.
+        ids: (N, I) integers, indices of rows.
+        column: the first of the three columns.
+    """
+    rows = stopped(rows)
+    known = known_value(rows), known_value(ids)
+    if known[0] is not None and known[1] is not None and known[0].ndim == known[1].ndim == 2:
+        from rts.operations import combine_loops as loops
+
+        host = loops.differences(read_only(known[0]), read_only(known[1]), column)
+        return engine_of(rows).constant(host, rows)
+    xp = namespace(rows, ids)
+    a, b, c = (xp.take(rows, ids[:, column + i], axis=0) for i in range(3))
+    return xp.concat([a - c, b - c], axis=1)
 
 
 def _alike(rows: Array, weights: Array) -> tuple[Array, Array]:

@@ -96,6 +96,13 @@ def pull(
             parallel(_weigh_sum, len(ids), rows, ids, column, count, affine, g, g_weights, work=3 * count * len(ids))
 
 
+def differences(rows: np.ndarray, ids: np.ndarray, column: int) -> np.ndarray:
+    """The differences (N, 2 C) of the first and the second of three rows to the third; NaN where an id names none."""
+    out = np.empty((len(ids), 2 * rows.shape[1]), rows.dtype)
+    parallel(_differences, len(ids), rows, ids, column, out, work=6 * len(ids))
+    return out
+
+
 # ------------------------------------------------------------------------------------------------- of any number
 
 
@@ -232,3 +239,15 @@ def _weigh(start, stop, rows, ids, column, g, g_weights):
                 u += g[n, i] * (rows[a, i] - rows[c, i])
                 v += g[n, i] * (rows[b, i] - rows[c, i])
         g_weights[n, 0], g_weights[n, 1], g_weights[n, 2:] = u, v, 0
+
+
+@loop
+def _differences(start, stop, rows, ids, column, out):
+    """Fill rows [start, stop) of `out` (N, 2 C); see `differences`."""
+    channels = rows.shape[1]
+    for n in range(start, stop):
+        known = _all_known(ids, n, column, 3, len(rows))
+        a, b, c = (ids[n, column], ids[n, column + 1], ids[n, column + 2]) if known else (0, 0, 0)
+        for k in range(channels if len(rows) else 0):
+            out[n, k] = rows[a, k] - rows[c, k] if known else np.nan
+            out[n, channels + k] = rows[b, k] - rows[c, k] if known else np.nan

@@ -77,7 +77,8 @@ def _specification(
     lengths = xp.sqrt(xp.sum(long * long, axis=-1))
     known = lengths[0, :] + lengths[1, :] < FAR
     sides, long, lengths = (xp.where(xp.reshape(known, (-1,) + (1,) * (x.ndim - 2)), x, 0.0) for x in (sides, long, lengths))
-    counts = xp.where(lengths <= NARROW, 1.0, xp.where(lengths <= WIDE, 2.0, 4.0))
+    one = xp.ones_like(lengths)
+    counts = xp.where(lengths <= NARROW, one, xp.where(lengths <= WIDE, 2 * one, 4 * one))
 
     def looked_up(places: list[tuple[Any, Any]], shares: list[Array]) -> tuple[Array, Array, Array]:
         """Sums of lookups, at places along both sides, times shares; and those of slopes right and down."""

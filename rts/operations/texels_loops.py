@@ -43,6 +43,29 @@ class Lookups(NamedTuple):
     nearest: bool
 
 
+def _taps() -> tuple[np.ndarray, np.ndarray]:
+    """Where footprints are looked up, by three times the logarithm (base 2) of the number along one side plus the other's.
+
+    Returns:
+        How many lookups there are on the two sides along b, inside, and on the two along a (9, 3). And for each lookup,
+        in this order, its place along a and along b, from −½ to ½, and its weight (9, 32, 3).
+    """
+    numbers, taps = np.zeros((9, 3), np.int64), np.zeros((9, 32, 3), np.float32)
+    for q in range(9):
+        count_a, count_b = 2 ** (q // 3), 2 ** (q % 3)
+        along_a, along_b = ((np.arange(n) + 0.5) / n - 0.5 for n in (count_a, count_b))
+        ends = (-0.5, 0.5)
+        of_a = [(end, t, 2 * end / count_b) for end in ends for t in along_b if count_a > 1]
+        inside = [(s, t, 1 / (count_a * count_b)) for s in along_a for t in along_b]
+        of_b = [(s, end, 2 * end / count_a) for end in ends for s in along_a if count_b > 1]
+        numbers[q] = len(of_a), len(inside), len(of_b)
+        taps[q, : sum(numbers[q])] = of_a + inside + of_b
+    return numbers, taps
+
+
+NUMBERS, TAPS = _taps()
+
+
 def places_of(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
     """Height, width and first row in the table (L, 3) int32 of images."""
     counts = np.array([height * width for height, width in sizes])
@@ -114,56 +137,75 @@ def _wrapped(index, count, wrap):
 
 
 @compiled
-def _place(lookups, n):
-    """Height, width and first row of the image of lookup n."""
-    image, places = lookups.image, lookups.places
-    place = image[n] if len(image) > 0 else 0
-    return places[place, 0], places[place, 1], places[place, 2]
-
-
-@compiled
-def _sides(lookups, n, height, width):
-    """The sides of a footprint in texels, right and down, and how many lookups there are along each."""
-    footprint, real = lookups.footprint, lookups.uv.dtype.type
-    ax = ay = bx = by = real(0)
-    if len(footprint) > 0:
-        ax, ay, bx, by = footprint[n, 0] * width, -footprint[n, 1] * height, footprint[n, 2] * width, footprint[n, 3]
-        by *= -height
+def _sides(du_dx, dv_dx, du_dy, dv_dy, height, width):
+    """The sides of a footprint in texels, right and down, and which of `TAPS` it is looked up at."""
+    ax, ay, bx, by = du_dx * width, -dv_dx * height, du_dy * width, -dv_dy * height
     a, b = np.sqrt(ax * ax + ay * ay), np.sqrt(bx * bx + by * by)
-    if not a + b < FAR:  # Neither infinite nor NaN.
-        ax = ay = bx = by = a = b = real(0)
-    count_a = 1 if a <= NARROW else 2 if a <= WIDE else 4
-    count_b = 1 if b <= NARROW else 2 if b <= WIDE else 4
-    return real(ax), real(ay), real(bx), real(by), count_a, count_b
-
-
-@compiled(inline="always")
-def _along(i, count, real):
-    """The place of lookup i of `count` along a side, from −½ to ½: all are as far apart."""
-    return (real(i) + real(0.5)) / real(count) - real(0.5)
+    known = a + b < FAR  # Neither infinite nor NaN.
+    of_a = 0 if a <= NARROW or not known else 3 if a <= WIDE else 6
+    of_b = 0 if b <= NARROW or not known else 1 if b <= WIDE else 2
+    none = 0 * width
+    return (ax, ay, bx, by, of_a + of_b) if known else (none, none, none, none, 0)
 
 
 @compiled
-def _centre(lookups, n, height, width):
-    """Where a lookup is in an image: columns from the centre of the leftmost texel, and rows from the uppermost's."""
-    uv, real, half = lookups.uv, lookups.uv.dtype.type, lookups.uv.dtype.type(0.5)
-    return uv[n, 0] * real(width) - half, (real(1) - uv[n, 1]) * real(height) - half
+def _found(x, y, height, width, first, wrap_u, wrap_v, nearest):
+    """The four texels around a point of an image, and the shares of the right and the lower ones.
 
-
-@compiled
-def _found(lookups, x, y, height, width, first):
-    """The four texels around a point of an image, and the shares of the right and the lower ones."""
-    wrap_u, wrap_v = lookups.wraps
-    if lookups.nearest:
-        half = lookups.uv.dtype.type(0.5)
-        x, y = np.floor(x + half), np.floor(y + half)
+    x and y are columns from the centre of the leftmost texel, and rows from the uppermost's.
+    """
+    if nearest:
+        x, y = np.floor(x + np.float32(0.5)), np.floor(y + np.float32(0.5))
     x0, y0 = np.floor(x), np.floor(y)
     # NaN names some texel, and its shares are none.
-    column = int(min(max(x0, -FAR), FAR)) if x0 == x0 else 0
-    row = int(min(max(y0, -FAR), FAR)) if y0 == y0 else 0
-    left, right = _wrapped(column, width, wrap_u), _wrapped(column + 1, width, wrap_u)
-    top, bottom = first + _wrapped(row, height, wrap_v) * width, first + _wrapped(row + 1, height, wrap_v) * width
-    return top + left, top + right, bottom + left, bottom + right, x - x0, y - y0
+    left = int(min(max(x0, -FAR), FAR)) if x0 == x0 else 0
+    upper = int(min(max(y0, -FAR), FAR)) if y0 == y0 else 0
+    right, lower = left + 1, upper + 1
+    if not (left >= 0 and right < width and upper >= 0 and lower < height):  # Most are inside.
+        left, right = _wrapped(left, width, wrap_u), _wrapped(right, width, wrap_u)
+        upper, lower = _wrapped(upper, height, wrap_v), _wrapped(lower, height, wrap_v)
+    top, bottom = first + upper * width, first + lower * width
+    a, b, c, d = np.uint32(top + left), np.uint32(top + right), np.uint32(bottom + left), np.uint32(bottom + right)
+    return a, b, c, d, x - x0, y - y0
+
+
+@compiled
+def _kind(ax, ay, bx, by, q):
+    """1 if a footprint's sides along b tell how the mean changes along a, plus 2 if those along a tell it along b."""
+    a, b = q >= 3, q % 3 > 0
+    determinant, aa, bb = ax * by - ay * bx, ax * ax + ay * ay, bx * bx + by * by
+    if a and b and determinant * determinant <= np.float32(SHEARED) * aa * bb:
+        a, b = aa >= bb, aa < bb
+    return (1 if a else 0) + (2 if b else 0)
+
+
+@compiled
+def _split(x, y, ax, ay, bx, by, kind):
+    """A direction as so much of a footprint's a, so much of b, and the rest."""
+    none = 0 * x
+    of_a = of_b = none
+    if kind == 3:
+        determinant = ax * by - ay * bx
+        of_a, of_b = (x * by - y * bx) / determinant, (y * ax - x * ay) / determinant
+        x, y = none, none
+    elif kind == 1:
+        of_a = (x * ax + y * ay) / (ax * ax + ay * ay)
+    elif kind == 2:
+        of_b = (x * bx + y * by) / (bx * bx + by * by)
+    return of_a, of_b, x - of_a * ax - of_b * bx if kind < 3 else none, y - of_a * ay - of_b * by if kind < 3 else none
+
+
+@compiled
+def _rates(i, numbers, share, direction, fx, fy):
+    """What four texels of lookup i, from the upper left one on, count by for the derivative along a split direction."""
+    (of_a, of_b, x, y), (sides, inside) = direction, numbers
+    one = 1 - 0 * fx
+    x, y = share * x, share * y
+    by = share * (of_a if i < sides else of_b)
+    if sides <= i < sides + inside:
+        return -(one - fy) * x - (one - fx) * y, (one - fy) * x - fx * y, -fy * x + (one - fx) * y, fy * x + fx * y
+    upper, lower = by * (one - fy), by * fy
+    return upper * (one - fx), upper * fx, lower * (one - fx), lower * fx
 
 
 @compiled
@@ -175,130 +217,137 @@ def _any(g, n):
     return found
 
 
+@compiled
+def _sum(table, k, a, b, c, d, of_a, of_b, of_c, of_d):
+    """The sum of a channel of four texels, each so many times."""
+    return of_a * table[a, k] + of_b * table[b, k] + of_c * table[c, k] + of_d * table[d, k]
+
+
 @loop
 def _look_up(start, stop, lookups, table, out):
     """Fill rows [start, stop) of `out` (N, C)."""
-    real = lookups.uv.dtype.type
+    uv, image, footprint, places, (wrap_u, wrap_v), nearest = lookups
+    real, channels = uv.dtype.type, table.shape[1]
+    one, half = real(1), real(0.5)
     for n in range(start, stop):
-        height, width, first = _place(lookups, n)
-        x, y = _centre(lookups, n, height, width)
-        ax, ay, bx, by, count_a, count_b = _sides(lookups, n, height, width)
-        out[n] = 0
-        share = real(1) / real(count_a * count_b)
-        for i in range(count_a):
-            for j in range(count_b):
-                s, t = _along(i, count_a, real), _along(j, count_b, real)
-                a, b, c, d, fx, fy = _found(lookups, x + s * ax + t * bx, y + s * ay + t * by, height, width, first)
-                for k in range(table.shape[1]):
-                    upper = table[a, k] + fx * (table[b, k] - table[a, k])
-                    lower = table[c, k] + fx * (table[d, k] - table[c, k])
-                    out[n, k] += share * (upper + fy * (lower - upper))
-
-
-@compiled
-def _add_at(lookups, table, x, y, place, share, k, total):
-    """Add the `share` of a lookup to row k of `total` (·, C)."""
-    height, width, first = place
-    a, b, c, d, fx, fy = _found(lookups, x, y, height, width, first)
-    for c_ in range(table.shape[1]):
-        upper = table[a, c_] + fx * (table[b, c_] - table[a, c_])
-        lower = table[c, c_] + fx * (table[d, c_] - table[c, c_])
-        total[k, c_] += share * (upper + fy * (lower - upper))
-
-
-@compiled
-def _slopes(lookups, table, n, slope, rises):
-    """Fill `slope` (2, C) with the slopes of lookup n, to the right and down, a texel each; `rises` (2, C) is room."""
-    real = lookups.uv.dtype.type
-    height, width, first = _place(lookups, n)
-    place = height, width, first
-    x, y = _centre(lookups, n, height, width)
-    ax, ay, bx, by, count_a, count_b = _sides(lookups, n, height, width)
-    slope[...] = 0
-    share = real(1) / real(count_a * count_b)
-    for i in range(count_a):
-        for j in range(count_b):
-            s, t = _along(i, count_a, real), _along(j, count_b, real)
-            a, b, c, d, fx, fy = _found(lookups, x + s * ax + t * bx, y + s * ay + t * by, height, width, first)
-            for k in range(table.shape[1]):
-                upper, lower = table[b, k] - table[a, k], table[d, k] - table[c, k]
-                slope[0, k] += share * (upper + fy * (lower - upper))
-                slope[1, k] += share * (table[c, k] + fx * lower - table[a, k] - fx * upper)
-    if count_a == 1 and count_b == 1:
-        return
-    # What the mean changes by from side to side of the footprint, less what slopes say.
-    rises[...] = 0
-    for i in range(2):
-        end = real(i) - real(0.5)
-        for j in range(count_b if count_a > 1 else 0):
-            t, weight = _along(j, count_b, real), real(2 * i - 1) / real(count_b)
-            _add_at(lookups, table, x + end * ax + t * bx, y + end * ay + t * by, place, weight, 0, rises)
-        for j in range(count_a if count_b > 1 else 0):
-            s, weight = _along(j, count_a, real), real(2 * i - 1) / real(count_a)
-            _add_at(lookups, table, x + s * ax + end * bx, y + s * ay + end * by, place, weight, 1, rises)
-    aa, ab, bb = ax * ax + ay * ay, ax * bx + ay * by, bx * bx + by * by
-    determinant = ax * by - ay * bx
-    both = count_a > 1 and count_b > 1 and determinant * determinant > real(SHEARED) * aa * bb
-    for k in range(table.shape[1]):
-        more_a = rises[0, k] - slope[0, k] * ax - slope[1, k] * ay
-        more_b = rises[1, k] - slope[0, k] * bx - slope[1, k] * by
-        if both:
-            slope[0, k] += (more_a * by - more_b * ay) / determinant
-            slope[1, k] += (more_b * ax - more_a * bx) / determinant
-        elif aa >= bb:
-            slope[0, k] += more_a * ax / aa
-            slope[1, k] += more_a * ay / aa
-        else:
-            slope[0, k] += more_b * bx / bb
-            slope[1, k] += more_b * by / bb
+        place = image[n] if len(image) > 0 else 0
+        rows, columns, first = places[place, 0], places[place, 1], places[place, 2]
+        height, width = real(rows), real(columns)
+        x, y = uv[n, 0] * width - half, (one - uv[n, 1]) * height - half
+        ax, ay, bx, by, q = real(0), real(0), real(0), real(0), 0
+        if len(footprint) > 0:
+            du, dv, du_down, dv_down = footprint[n, 0], footprint[n, 1], footprint[n, 2], footprint[n, 3]
+            ax, ay, bx, by, q = _sides(du, dv, du_down, dv_down, height, width)
+        red = green = blue = real(0)  # In variables, most textures take half the time.
+        for k in range(channels):
+            out[n, k] = 0
+        for i in range(NUMBERS[q, 0], NUMBERS[q, 0] + NUMBERS[q, 1]):
+            s, t, share = real(TAPS[q, i, 0]), real(TAPS[q, i, 1]), real(TAPS[q, i, 2])
+            px, py = x + s * ax + t * bx, y + s * ay + t * by
+            a, b, c, d, fx, fy = _found(px, py, rows, columns, first, wrap_u, wrap_v, nearest)
+            upper, lower = share * (one - fy), share * fy
+            p0, p1, p2, p3 = upper * (one - fx), upper * fx, lower * (one - fx), lower * fx
+            if channels == 3:
+                red += _sum(table, 0, a, b, c, d, p0, p1, p2, p3)
+                green += _sum(table, 1, a, b, c, d, p0, p1, p2, p3)
+                blue += _sum(table, 2, a, b, c, d, p0, p1, p2, p3)
+            for k in range(0 if channels == 3 else channels):
+                out[n, k] += _sum(table, k, a, b, c, d, p0, p1, p2, p3)
+        if channels == 3:
+            out[n, 0], out[n, 1], out[n, 2] = red, green, blue
 
 
 @loop
 def _add_moved(start, stop, lookups, table, t_uv, out):
     """Add to rows [start, stop) of `out` (N, C) the derivative along `t_uv` (N, 2)."""
-    slope, rises = np.empty((2, table.shape[1]), table.dtype), np.empty((2, table.shape[1]), table.dtype)
+    uv, image, footprint, places, (wrap_u, wrap_v), nearest = lookups
+    real = uv.dtype.type
+    one, half = real(1), real(0.5)
     for n in range(start, stop):
-        _slopes(lookups, table, n, slope, rises)
-        height, width, _ = _place(lookups, n)
-        right, down = t_uv[n, 0] * width, -t_uv[n, 1] * height
-        for k in range(table.shape[1]):
-            out[n, k] += right * slope[0, k] + down * slope[1, k]
+        place = image[n] if len(image) > 0 else 0
+        rows, columns, first = places[place, 0], places[place, 1], places[place, 2]
+        height, width = real(rows), real(columns)
+        x, y = uv[n, 0] * width - half, (one - uv[n, 1]) * height - half
+        ax, ay, bx, by, q = real(0), real(0), real(0), real(0), 0
+        if len(footprint) > 0:
+            du, dv, du_down, dv_down = footprint[n, 0], footprint[n, 1], footprint[n, 2], footprint[n, 3]
+            ax, ay, bx, by, q = _sides(du, dv, du_down, dv_down, height, width)
+        kind, (sides, inside, others) = _kind(ax, ay, bx, by, q), (NUMBERS[q, 0], NUMBERS[q, 1], NUMBERS[q, 2])
+        direction = _split(t_uv[n, 0] * width, -t_uv[n, 1] * height, ax, ay, bx, by, kind)
+        for i in range(0 if kind % 2 == 1 else sides, sides + inside + (others if kind >= 2 else 0)):
+            if kind == 3 and sides <= i < sides + inside:
+                continue
+            s, t, share = real(TAPS[q, i, 0]), real(TAPS[q, i, 1]), real(TAPS[q, i, 2])
+            px, py = x + s * ax + t * bx, y + s * ay + t * by
+            a, b, c, d, fx, fy = _found(px, py, rows, columns, first, wrap_u, wrap_v, nearest)
+            p0, p1, p2, p3 = _rates(i, (sides, inside), share, direction, fx, fy)
+            for k in range(table.shape[1]):
+                out[n, k] += _sum(table, k, a, b, c, d, p0, p1, p2, p3)
 
 
 @loop
 def _pull_uv(start, stop, lookups, table, g, g_uv):
     """Fill rows [start, stop) of `g_uv` (N, 2) from `g` (N, C)."""
-    slope, rises = np.empty((2, table.shape[1]), table.dtype), np.empty((2, table.shape[1]), table.dtype)
+    uv, image, footprint, places, (wrap_u, wrap_v), nearest = lookups
+    real = uv.dtype.type
+    zero, one, half = real(0), real(1), real(0.5)
     for n in range(start, stop):
         if not _any(g, n):
             continue
-        _slopes(lookups, table, n, slope, rises)
-        right = down = g.dtype.type(0)
-        for k in range(table.shape[1]):
-            right += g[n, k] * slope[0, k]
-            down += g[n, k] * slope[1, k]
-        height, width, _ = _place(lookups, n)
+        place = image[n] if len(image) > 0 else 0
+        rows, columns, first = places[place, 0], places[place, 1], places[place, 2]
+        height, width = real(rows), real(columns)
+        x, y = uv[n, 0] * width - half, (one - uv[n, 1]) * height - half
+        ax, ay, bx, by, q = real(0), real(0), real(0), real(0), 0
+        if len(footprint) > 0:
+            du, dv, du_down, dv_down = footprint[n, 0], footprint[n, 1], footprint[n, 2], footprint[n, 3]
+            ax, ay, bx, by, q = _sides(du, dv, du_down, dv_down, height, width)
+        kind, (sides, inside, others) = _kind(ax, ay, bx, by, q), (NUMBERS[q, 0], NUMBERS[q, 1], NUMBERS[q, 2])
+        to_right, to_below = _split(one, zero, ax, ay, bx, by, kind), _split(zero, one, ax, ay, bx, by, kind)
+        right = down = zero
+        for i in range(0 if kind % 2 == 1 else sides, sides + inside + (others if kind >= 2 else 0)):
+            if kind == 3 and sides <= i < sides + inside:
+                continue
+            s, t, share = real(TAPS[q, i, 0]), real(TAPS[q, i, 1]), real(TAPS[q, i, 2])
+            px, py = x + s * ax + t * bx, y + s * ay + t * by
+            a, b, c, d, fx, fy = _found(px, py, rows, columns, first, wrap_u, wrap_v, nearest)
+            of_a = of_b = of_c = of_d = zero
+            for k in range(table.shape[1]):
+                of_a += g[n, k] * table[a, k]
+                of_b += g[n, k] * table[b, k]
+                of_c += g[n, k] * table[c, k]
+                of_d += g[n, k] * table[d, k]
+            p0, p1, p2, p3 = _rates(i, (sides, inside), share, to_right, fx, fy)
+            right += p0 * of_a + p1 * of_b + p2 * of_c + p3 * of_d
+            p0, p1, p2, p3 = _rates(i, (sides, inside), share, to_below, fx, fy)
+            down += p0 * of_a + p1 * of_b + p2 * of_c + p3 * of_d
         g_uv[n, 0], g_uv[n, 1] = right * width, -down * height
 
 
 @loop
 def _scatter(lookups, g, g_table):
     """Add to `g_table` (M, C) the gradient of the texels, from `g` (N, C)."""
-    real, one = lookups.uv.dtype.type, g.dtype.type(1)
-    for n in range(len(lookups.uv)):
+    uv, image, footprint, places, (wrap_u, wrap_v), nearest = lookups
+    real = uv.dtype.type
+    one, half = real(1), real(0.5)
+    for n in range(len(uv)):
         if not _any(g, n):
             continue
-        height, width, first = _place(lookups, n)
-        x, y = _centre(lookups, n, height, width)
-        ax, ay, bx, by, count_a, count_b = _sides(lookups, n, height, width)
-        share = one / g.dtype.type(count_a * count_b)
-        for i in range(count_a):
-            for j in range(count_b):
-                s, t = _along(i, count_a, real), _along(j, count_b, real)
-                a, b, c, d, fx, fy = _found(lookups, x + s * ax + t * bx, y + s * ay + t * by, height, width, first)
-                for k in range(g.shape[1]):
-                    part = share * g[n, k]
-                    g_table[a, k] += (one - fx) * (one - fy) * part
-                    g_table[b, k] += fx * (one - fy) * part
-                    g_table[c, k] += (one - fx) * fy * part
-                    g_table[d, k] += fx * fy * part
+        place = image[n] if len(image) > 0 else 0
+        rows, columns, first = places[place, 0], places[place, 1], places[place, 2]
+        height, width = real(rows), real(columns)
+        x, y = uv[n, 0] * width - half, (one - uv[n, 1]) * height - half
+        ax, ay, bx, by, q = real(0), real(0), real(0), real(0), 0
+        if len(footprint) > 0:
+            du, dv, du_down, dv_down = footprint[n, 0], footprint[n, 1], footprint[n, 2], footprint[n, 3]
+            ax, ay, bx, by, q = _sides(du, dv, du_down, dv_down, height, width)
+        for i in range(NUMBERS[q, 0], NUMBERS[q, 0] + NUMBERS[q, 1]):
+            s, t, share = real(TAPS[q, i, 0]), real(TAPS[q, i, 1]), real(TAPS[q, i, 2])
+            px, py = x + s * ax + t * bx, y + s * ay + t * by
+            a, b, c, d, fx, fy = _found(px, py, rows, columns, first, wrap_u, wrap_v, nearest)
+            upper, lower = share * (one - fy), share * fy
+            for k in range(g.shape[1]):
+                g_table[a, k] += upper * (one - fx) * g[n, k]
+                g_table[b, k] += upper * fx * g[n, k]
+                g_table[c, k] += lower * (one - fx) * g[n, k]
+                g_table[d, k] += lower * fx * g[n, k]

@@ -60,7 +60,7 @@ def _checked(gbuffer: GBuffer, part: CheckedPart, samples: Samples) -> GBuffer:
 
 def shaded_at_once(part: CheckedPart) -> bool:
     """True if a part's shader takes the samples of several views in one call, or gives one colour."""
-    return part.uniform or part.takes_views
+    return part.uniform or (part.takes_views and part.reads is not None)
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:

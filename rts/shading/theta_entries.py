@@ -42,8 +42,8 @@ def check_entry(entry: str, value: Any, expected: str, ok: bool) -> Any:
 
 
 def check_base(name: str, base: Array) -> None:
-    """Refuse base colours (N, C) of `BRIGHTEST` or more; NaN is refused with the shader's result, by its cause."""
+    """Refuse base colours (N, C) of `BRIGHTEST` or more; what is not finite is, with the shader's result, by its cause."""
     if not is_finite(base, below=BRIGHTEST):
         values = value_of(base)
-        if values is not None and not np.isnan(values).any():
+        if values is not None and np.isfinite(values).all():
             raise InputError(f"{name} holds a number of {BRIGHTEST:g} or more; expected smaller colours")

@@ -269,7 +269,7 @@ def test_lookups_that_are_nowhere_name_no_texel():
         found = texels(table, nowhere, [(3, 4)], wrap=(wrap, wrap))
         with np.errstate(invalid="ignore"):
             by_arrays = TEXELS.specification(
-                table, nowhere, np.zeros(0, np.int32), sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
+                table, nowhere, np.zeros(0, np.int32), table[:0], sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
             )
         assert np.isnan(found[:2]).all() and np.isfinite(found[2]).all()
         np.testing.assert_array_equal(np.isnan(found), np.isnan(by_arrays))
@@ -282,7 +282,7 @@ def test_far_lookups_are_those_of_array_code(dtype):
     for wrap in ("repeat", "clamp"):  # By "clamp" the first or the last texel of a row, however far.
         found = texels(table, far, [(3, 4)], wrap=(wrap, wrap))
         by_arrays = TEXELS.specification(
-            table, far, np.zeros(0, np.int32), sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
+            table, far, np.zeros(0, np.int32), table[:0], sizes=((3, 4),), wrap=(wrap, wrap), filter="linear"
         )
         np.testing.assert_allclose(found, by_arrays, atol=1e-6)
 
@@ -315,6 +315,8 @@ def cases():
     view = np.array([1] * 8 + [3] * 12, np.int32)
     table, uv = rng.random((3 * 4 + 5 * 2, 3)), 1.5 * rng.normal(size=(20, 2))
     image, sizes = rng.integers(0, 2, 20).astype(np.int32), {"sizes": ((3, 4), (5, 2))}
+    over = rng.normal(size=(20, 4)) * np.exp(rng.uniform(-4, 2, (20, 1)))
+    over[:4] = [(0.3, 0.2, 0.6, 0.4), (0, 0, 0, 0), (0.9, 0, 0.01, 0.02), (0.01, 0.02, 0, -4)]
     return {
         "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
         "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
@@ -325,9 +327,9 @@ def cases():
         "projection": (projection.PROJECTION, [ahead[0], points], {}),
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
         "unit": (UNIT, [points], {}),
-        "texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("repeat", "mirror"), "filter": "linear"}),
-        "texels of one": (TEXELS, [table, uv, image[:0]], {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"}),
-        "nearest texels": (TEXELS, [table, uv, image], {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"}),
+        "texels": (TEXELS, [table, uv, image, over], {**sizes, "wrap": ("repeat", "mirror"), "filter": "linear"}),
+        "texels of one": (TEXELS, [table, uv, image[:0], over[:0]], {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"}),
+        "nearest texels": (TEXELS, [table, uv, image, over], {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"}),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 

@@ -21,9 +21,10 @@ import rts
 from rts import Camera, GBuffer
 from rts.contracts.records import Cells
 from rts.errors import InputError
+from rts.operations.texels import TEXELS
 from rts.plugin_api.records import Samples
 from rts.shading.shaders import Textured
-from rts.shading.textures import mip_levels, sample_texture, taps_of
+from rts.shading.textures import level_of, mip_levels, sample_texture
 from rts.shading.uv_footprints import uv_footprint
 
 pytestmark = pytest.mark.rendering
@@ -72,75 +73,123 @@ def test_each_level_averages_equal_areas_of_the_one_before(target, size):
         np.testing.assert_allclose(below, fine.reshape(m, h, n, w, 3).mean(axis=(1, 3)), atol=1e-6)
 
 
-def test_taps_and_level_have_the_variance_of_the_footprint_in_both_axes():
+def test_a_footprint_is_a_few_texels_of_its_level():
     sides = np.exp(RNG.uniform(-2, 3, (300, 2)))
     longer, shorter = sides.max(axis=1), sides.min(axis=1)
     turned, other = (np.array([np.cos(a), np.sin(a)]).T for a in RNG.uniform(0, 6, (2, 300)))
     along, across = turned * longer[:, None], np.stack([-turned[:, 1], turned[:, 0]], axis=1) * shorter[:, None]
     x, y = (other[:, i : i + 1] * along + (1 - 2 * i) * other[:, 1 - i : 2 - i] * across for i in (0, 1))
-    level, step, count = taps_of(np.concatenate([x, y], axis=1) / [64, 16, 64, 16], (16, 64))
-    step, few = step * [64, 16], level < 6
-    np.testing.assert_allclose((step * across).sum(axis=1), 0, atol=1e-9)
-    spread = (step**2).sum(axis=1) * (count**2 - 1) / 12
-    np.testing.assert_allclose((spread + (4**level - 1) / 4)[few], longer[few] ** 2 / 12, rtol=1e-6)
-    enough = few & (count > 1) & (longer**2 + 3 < count**2 * (shorter**2 + 3))
-    np.testing.assert_allclose((4 ** level[enough] - 1) / 4, shorter[enough] ** 2 / 12, rtol=1e-6)
-    assert {1, 2, 4} == set(count) and enough.sum() > 50 and (count[longer < 1.4 * shorter] == 1).all()
+    texel = 2 ** level_of(np.concatenate([x, y], axis=1) / [64, 16, 64, 16], (16, 64))
+    coarse = (texel > 1) & (texel < 64)
+    slender = longer > 2 * shorter
+    assert (slender & coarse).sum() > 50 and (~slender & coarse).sum() > 20
+    np.testing.assert_allclose((shorter / texel)[coarse & ~slender], 2.5, rtol=1e-6)
+    np.testing.assert_allclose((longer / texel)[coarse & slender], 5, rtol=1e-6)
+    assert (longer[texel == 1] <= 5 + 1e-9).all()
 
 
 def test_wild_footprints_have_a_level():
     footprint = np.array([(0, 0, 0, 0), (9, 0, 0, 18), (0, np.inf, 0, 0), (0, np.nan, 0, 0), (1e30, 0, 0, 0)])
-    level, step, count = taps_of(footprint.astype(np.float32), (8, 16))
+    level = level_of(footprint.astype(np.float32), (8, 16))
     np.testing.assert_allclose(level[[0, 1, 3]], [0, 4, 0])
-    assert np.isfinite(step).all() and (level >= 0).all() and (level <= 4).all()
+    assert (level >= 0).all() and (level <= 4).all()
 
 
 @pytest.mark.parametrize("target", ALL)
 def test_lookup_is_linear_between_levels(target):
     texture, uv = RNG.random((6, 5, 3)), RNG.uniform(-1, 2, (20, 2))
     for level in (0, 0.25, 1, 1.75, 2, 7):
-        side = np.sqrt(3 * (4**level - 1))
+        side = 2.5 * 2**level
         footprint = np.tile([side / 5, 0, 0, side / 6], (20, 1))
         finer, share = (min(int(level), 1), min(level, 2) - min(int(level), 1))
-        a, b = (sample_texture(x, uv) for x in mip_levels(texture)[finer : finer + 2])
+        a, b = (sample_texture(x, uv, "repeat", footprint) for x in mip_levels(texture)[finer : finer + 2])
         given = arrays(target, (texture, uv, footprint))
-        found = to_numpy(sample_texture(given[0], given[1], "repeat", given[2]))
+        found = to_numpy(sample_texture(given[0], given[1], "repeat", given[2], mip=True))
         np.testing.assert_allclose(found, a + share * (b - a), atol=2e-5)
 
 
+# ---------------------------------------------------------------------------------------- means over footprints
+
+
 @pytest.mark.parametrize("target", ALL)
-def test_slanted_footprints_are_means_of_taps_side_by_side(target):
-    texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (40, 2))
-    footprint = RNG.uniform(-0.4, 0.4, (40, 4))
-    level, step, count = taps_of(footprint, (12, 10))
-    assert set(count) == {1, 2, 4}
-    expected = 0
-    for i in range(4):
-        place, side = uv + (i - 0.5 * (count - 1))[:, None] * step, np.sqrt(3 * (4**level - 1))
-        tap = sample_texture(texture, place, "repeat", side[:, None] * [1 / 10, 0, 0, 1 / 12])
-        expected = expected + np.where(i < count, 1 / count, 0)[:, None] * tap
+def test_footprints_are_means_of_lookups_side_by_side(target):
+    texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (60, 2))
+    footprint = RNG.uniform(-1, 1, (60, 4)) * np.exp(RNG.uniform(-4, 0, (60, 1)))
+    a, b = footprint[:, :2], footprint[:, 2:]
+    counts = [np.select([n <= 0.5, n <= 5], [1, 2], 4) for n in (np.hypot(*(x * [10, 12]).T) for x in (a, b))]
+    assert {(1, 1), (2, 2), (2, 4), (4, 4)} <= set(zip(*counts, strict=True))
+    expected = np.zeros((60, 3))
+    for n, (i, j) in enumerate(zip(*counts, strict=True)):
+        s, t = (((np.arange(m) + 0.5) / m - 0.5)[:, None] for m in (i, j))
+        places = (uv[n] + s * a[n])[:, None] + t * b[n]
+        expected[n] = sample_texture(texture, places.reshape(-1, 2)).mean(axis=0)
     given = arrays(target, (texture, uv, footprint))
     np.testing.assert_allclose(to_numpy(sample_texture(given[0], given[1], "repeat", given[2])), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("mip", [False, True])
+def test_the_derivative_in_uv_is_that_of_the_mean(target, mip):
+    """Along a side it is the difference of the means over the two sides across: here of a ramp, and of steps."""
+    steps = np.repeat(np.repeat(np.arange(16) % 2, 4)[None, :, None] * 1.0, 48, axis=0)  # Along u, four texels each.
+    ramp = np.repeat(np.linspace(1, 0, 48)[:, None, None], 64, axis=1)  # Along v, from 1 down to 0.
+    texture, uv = np.concatenate([steps, ramp, 0 * ramp], axis=2), RNG.uniform(0.3, 0.7, (200, 2))
+    footprint = np.tile([2.0 / 64, 0.5 / 48, -0.6 / 64, 2.4 / 48], (200, 1))
+    on = arrays(target, (texture, footprint))
+    of_steps, of_ramp = (
+        gradient(target, lambda x, k=k: sample_texture(on[0], x, "repeat", on[1], mip=mip)[:, k].sum(), arrays(target, uv))
+        for k in (0, 1)
+    )
+    np.testing.assert_allclose(of_ramp, np.tile([0, 48 / 47], (200, 1)), atol=2e-3)
+    # By closed form: the mean over many more places.
+    s, t = np.meshgrid((np.arange(64) + 0.5) / 64 - 0.5, (np.arange(64) + 0.5) / 64 - 0.5)
+    inside = np.stack([s * footprint[0, i] + t * footprint[0, 2 + i] for i in (0, 1)], axis=-1).reshape(-1, 2)
+    slopes = []
+    for place in uv:
+        a, b = (sample_texture(texture, place + inside + [d, 0])[:, 0].mean() for d in (0.01 / 64, -0.01 / 64))
+        slopes.append((a - b) / (0.02 / 64))
+    error = np.linalg.norm(of_steps[:, 0] - slopes) / np.linalg.norm(slopes)
+    assert error < 0.12  # A texel's own slope is off by 1.0.
+    by_points = gradient(target, lambda x: sample_texture(on[0], x)[:, 0].sum(), arrays(target, uv))
+    assert np.linalg.norm(by_points[:, 0] - slopes) / np.linalg.norm(slopes) > 0.5
+
+
+def test_footprints_that_are_slivers_or_lines_tell_what_they_can():
+    """Sides of one direction, and one side alone: along it the derivative is a difference, else the mean slope."""
+    ramp = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1)
+    texture, uv = np.concatenate([ramp, 0 * ramp[..., :1]], axis=2), np.full((4, 2), 0.5)
+    footprint = np.array([(4, 0, 2, 0), (4, 4, -4, -4), (0, 3, 0, 0), (0, 0, 0.01, 3)]) / 20
+    for moved, of_x, of_y in (((1, 0), 20, 0), ((0, 1), 0, -20)):
+        out = np.empty((4, 3))
+        TEXELS.push(
+            [texture.reshape(-1, 3), uv, np.zeros(0, np.int32), footprint],
+            [None, np.tile(np.float64(moved), (4, 1))],
+            out,
+            sizes=((20, 20),),
+            wrap=("clamp", "clamp"),
+            filter="linear",
+        )
+        np.testing.assert_allclose(out, np.tile([of_x, of_y, 0], (4, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
 def test_wrap_modes_hold_in_every_level(wrap):
     texture, uv, coarse = RNG.random((8, 8, 3)), RNG.uniform(-2, 3, (50, 2)), np.zeros((50, 4))
-    coarse[:, [0, 3]] = 3 / 8  # Level 1.
-    np.testing.assert_allclose(
-        sample_texture(texture, uv, wrap, coarse), sample_texture(mip_levels(texture)[1], uv, wrap), atol=1e-12
-    )
+    coarse[:, [0, 3]] = 5 / 8  # Level 1.
+    expected = sample_texture(mip_levels(texture)[1], uv, wrap, coarse)
+    np.testing.assert_allclose(sample_texture(texture, uv, wrap, coarse, mip=True), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_gradients_in_texture_and_uv_are_finite_differences(target):
-    given = {"texture": RNG.random((5, 6, 3)), "uv": RNG.uniform(0, 1, (7, 2))}
-    footprint, weights = RNG.uniform(0, 0.7, (7, 4)), RNG.standard_normal((7, 3))
+@pytest.mark.parametrize("mip", [False, True])
+def test_gradients_in_the_texture_are_finite_differences(target, mip):
+    given = {"texture": RNG.random((5, 6, 3))}
+    uv, footprint, weights = RNG.uniform(0, 1, (7, 2)), RNG.uniform(0, 0.7, (7, 4)), RNG.standard_normal((7, 3))
 
-    def f(x, footprint=footprint, weights=weights):
-        return (sample_texture(x["texture"], x["uv"], "repeat", footprint) * weights).sum()
+    def f(x, uv=uv, footprint=footprint, weights=weights):
+        return (sample_texture(x["texture"], uv, "repeat", footprint, mip=mip) * weights).sum()
 
-    on = arrays(target, (footprint, weights))
+    on = arrays(target, (uv, footprint, weights))
     found = gradient(target, lambda x: f(x, *on), arrays(target, given))
     expected = finite_difference(f, given)
     for name in given:
@@ -362,4 +411,4 @@ def test_surfaces_of_other_parameters_are_refused():
     samples = Samples(one, three, Cells(np.zeros((1, 1, 1), np.int32), np.ones((1, 1, 1))), np.int32(0))
     surface = mesh_part((vertices, faces)).surface
     with pytest.raises(InputError, match="3 parameters a sample"):
-        uv_footprint(surface, {}, samples, {}, FRONT, SIZE, rts.engine_of(three), None)
+        uv_footprint(surface, {}, samples, {}, FRONT.pixel_rows(SIZE), None, rts.engine_of(three), None)

@@ -130,9 +130,10 @@ def test_shading_with_a_normal_map_has_the_derivatives_of_finite_differences(tar
     vertices = vertices + 0.2 * rng.standard_normal(vertices.shape).astype(np.float32)
     constant = {"normal_map": rng.uniform(-0.4, 0.4, (3, 4, 3)) + [0, 0, 0.8], "roughness": np.array(0.5)}
     moving = {"vertices": vertices.astype(np.float64), "uv": UV + 0.1 * rng.standard_normal((4, 2))}
-    weights = rng.standard_normal((10, 12, 3))
+    size = 30, 36  # Pixels of less than half a texel, where maps are looked up at points.
+    weights = rng.standard_normal((*size, 3))
     part = rts.Part(rts.Mesh(faces), arrays("numpy", {**constant, **moving}, np.float64), "pbr")
-    frozen = rts.sample(part, EYE, (10, 12), splatter="none")
+    frozen = rts.sample(part, EYE, size, splatter="none")
 
     def f(theta, fixed, weights):
         image = rts.render_samples(frozen, part.replace(theta={**fixed, **theta}), EYE, splatter="none")

@@ -322,7 +322,7 @@ def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_r
     for promises, kinds in (
         ({}, [Camera] * 3),
         ({"takes_views": True}, [Camera] * 3),
-        ({"takes_views": True, "reads": ("uv_footprint",)}, [Camera] * 3),
+        ({"takes_views": True, "reads": ("uv_footprint",)}, [RowCameras]),
         ({"takes_views": True, "reads": ()}, [RowCameras]),
     ):
         vars(shader).update(promises)
