@@ -33,7 +33,7 @@ def texels(
     """Bilinear lookups (N, C), differentiable in the table and in uv.
 
     Over a footprint they are the mean of lookups at one place along a side of up to half a texel, at two along one of
-    up to five texels, and at four along longer ones. The derivative in uv is that of the footprint's mean, by as many
+    up to three texels, at four up to six, and at eight beyond, if there are at most 16 of all. The derivative in uv is that of the footprint's mean, by as many
     lookups along each of its sides; where a side has one lookup, by the mean of the slopes there.
 
     Args:
@@ -68,44 +68,61 @@ def _specification(
     xp, options = namespace(table, uv), {"sizes": sizes, "wrap": wrap, "filter": filter}
     if not footprint.shape[0]:
         return _points(table, uv, image, **options)[0]
-    from rts.operations.texels_loops import FAR, NARROW, SHEARED, WIDE
+    from rts.operations.texels_loops import FAR, MOST, NARROW, ON_SIDES, SHEARED, WIDE
 
     still, height, width = stopped(uv), *_places(uv, image, sizes)[:2]
-    sides = xp.stack([footprint[:, :2], footprint[:, 2:]])
-    # In texels, right and down.
-    long = xp.stack([sides[..., 0] * width, -sides[..., 1] * height], axis=-1)
-    lengths = xp.sqrt(xp.sum(long * long, axis=-1))
-    known = lengths[0, :] + lengths[1, :] < FAR
-    sides, long, lengths = (xp.where(xp.reshape(known, (-1,) + (1,) * (x.ndim - 2)), x, 0.0) for x in (sides, long, lengths))
-    one = xp.ones_like(lengths)
-    counts = xp.where(lengths <= NARROW, one, xp.where(lengths <= WIDE, 2 * one, 4 * one))
+    a, b = ((footprint[:, i] * width, -footprint[:, i + 1] * height) for i in (0, 2))  # Right and down, in texels.
+    lengths = [xp.sqrt(x * x + y * y) for x, y in (a, b)]
+    known = lengths[0] + lengths[1] < FAR
+    footprint = xp.where(known[:, None], footprint, 0.0)
+    (ax, ay), (bx, by) = ([xp.where(known, x, 0.0)[:, None] for x in side] for side in (a, b))
+    one = xp.ones_like(lengths[0])
+    fit = [
+        xp.where(
+            x > NARROW, xp.where(x > WIDE, xp.where(x > 2 * WIDE, 3 * one, 2 * one), one), 0 * one
+        )
+        for x in lengths
+    ]
+    fit = [xp.where(other >= 2, xp.clip(own, None, 2), own) for own, other in (fit, fit[::-1])]
+    count_a, count_b = (xp.where(known, 2**x, 1.0) for x in fit)
 
-    def looked_up(places: list[tuple[Any, Any]], shares: list[Array]) -> tuple[Array, Array, Array]:
-        """Sums of lookups, at places along both sides, times shares; and those of slopes right and down."""
-        at = xp.concat([still + a[:, None] * sides[0, ...] + b[:, None] * sides[1, ...] for a, b in places])
+    def looked_up(places: list[tuple[Array, Array]], shares: list[Array]) -> list[Array]:
+        """Sums of lookups, and of slopes right and down, at places along both sides, times shares."""
+        at = xp.concat([still + s[:, None] * footprint[:, :2] + t[:, None] * footprint[:, 2:] for s, t in places])
         share, number = xp.concat(shares)[:, None], xp.concat([image] * len(places))
         found = _points(table, at, number, **options)
-        return tuple(xp.sum(xp.reshape(share * x, (len(places), *still.shape[:1], -1)), axis=0) for x in found)
+        return [xp.sum(xp.reshape(share * x, (len(places), *still.shape[:1], -1)), axis=0) for x in found]
 
-    zero, numbers = xp.zeros_like(still[:, 0]), range(4)
-    along = [[xp.where(i < n, (i + 0.5) / n - 0.5, zero) for i in numbers] for n in (counts[0, :], counts[1, :])]
-    share = [[xp.where(i < n, 1 / n, zero) for i in numbers] for n in (counts[0, :], counts[1, :])]
-    inside = [(a, b, s * t) for a, s in zip(along[0], share[0], strict=True) for b, t in zip(along[1], share[1], strict=True)]
-    mean, right, down = looked_up([(a, b) for a, b, _ in inside], [s for *_, s in inside])
+    def along(i: Array, count: Array) -> Array:
+        return (xp.clip(i, None, count - 1) + 0.5) / count - 0.5
+
+    within = [(xp.floor(i / count_b), i - xp.floor(i / count_b) * count_b) for i in range(MOST)]
+    mean, right, down = looked_up(
+        [(along(i, count_a), along(j, count_b)) for i, j in within],
+        [xp.where(i < count_a, 1 / (count_a * count_b), 0.0) for i, _ in within],
+    )
     if filter == "nearest":
         return mean
-    ends = [(sign / 2 + zero, sign) for sign in (-1, 1)]
-    rise_a = looked_up([(end, b) for end, _ in ends for b in along[1]], [sign * t for _, sign in ends for t in share[1]])
-    rise_b = looked_up([(a, end) for end, _ in ends for a in along[0]], [sign * s for _, sign in ends for s in share[0]])
-    (ax, ay), (bx, by) = ((side[:, 0:1], side[:, 1:2]) for side in (long[0, ...], long[1, ...]))
-    more_a, more_b = rise_a[0] - right * ax - down * ay, rise_b[0] - right * bx - down * by
-    determinant, (square_a, square_b) = ax * by - ay * bx, (lengths * lengths)[..., None]
-    wide_a, wide_b = (counts > 1)[..., None]
+    wide_a, wide_b = count_a > 1, count_b > 1
+    of_a, places, shares = xp.where(wide_a, 2 * count_b, 0.0), [], []
+    for i in range(ON_SIDES):  # Those on the two sides along b, then on those along a.
+        on_a, j = i < of_a, xp.where(i < of_a, i * one, i - of_a)
+        end, j = j - 2 * xp.floor(j / 2) - 0.5, xp.floor(j / 2)
+        places.append((xp.where(on_a, end, along(j, count_a)), xp.where(on_a, along(j, count_b), end)))
+        there = on_a | (wide_b & (j < count_a))
+        shares.append(xp.where(there, 2 * end / xp.where(on_a, count_b, count_a), 0.0))
+    rises = []
+    for first in (True, False):
+        chosen = [xp.where((i < of_a) == first, share, 0.0) for i, share in enumerate(shares)]
+        rises.append(looked_up(places, chosen)[0])
+    more_a, more_b = rises[0] - right * ax - down * ay, rises[1] - right * bx - down * by
+    determinant, square_a, square_b = ax * by - ay * bx, ax * ax + ay * ay, bx * bx + by * by
+    wide_a, wide_b = wide_a[:, None], wide_b[:, None]
     both = wide_a & wide_b & (determinant * determinant > SHEARED * square_a * square_b)
-    of_a = wide_a & (both | (square_a >= square_b))
-    of_b = wide_b & (both | (square_a < square_b))
-    by_a, by_b = (xp.where(x, y, 1.0) for x, y in ((of_a, xp.where(both, determinant, square_a)), (of_b, xp.where(both, determinant, square_b))))
-    more_a, more_b = xp.where(of_a, more_a / by_a, 0.0), xp.where(of_b, more_b / by_b, 0.0)
+    by_a = wide_a & (both | ~wide_b | (square_a >= square_b))
+    by_b = wide_b & (both | ~wide_a | (square_a < square_b))
+    more_a = xp.where(by_a, more_a / xp.where(by_a, xp.where(both, determinant, square_a), 1.0), 0.0)
+    more_b = xp.where(by_b, more_b / xp.where(by_b, xp.where(both, determinant, square_b), 1.0), 0.0)
     right = right + more_a * xp.where(both, by, ax) + more_b * xp.where(both, -ay, bx)
     down = down + more_a * xp.where(both, -bx, ay) + more_b * xp.where(both, ax, by)
     moved = uv - still

@@ -17,8 +17,11 @@ WRAPS = {"repeat": 1, "mirror": 2}
 """Numbers of continuations; 0 is that of "clamp"."""
 FAR = 2.0**53
 """Texels farther out count as this one, which is as an integer is."""
-NARROW, WIDE = 0.5, 5.0
-"""A side of a footprint of up to so many texels takes one lookup, or two; longer ones take four."""
+NARROW, WIDE = 0.5, 3.0
+"""A side of a footprint of up to NARROW texels takes one lookup, of up to WIDE two, of up to twice as many four, and of
+more eight, where the other side takes at most two; else four."""
+MOST, ON_SIDES = 16, 20
+"""Lookups inside a footprint, and on its sides, at most."""
 SHEARED = 1e-3
 """The square of the least sine between the sides of a footprint of which both tell slopes."""
 
@@ -44,15 +47,17 @@ class Lookups(NamedTuple):
 
 
 def _taps() -> tuple[np.ndarray, np.ndarray]:
-    """Where footprints are looked up, by three times the logarithm (base 2) of the number along one side plus the other's.
+    """Where footprints are looked up, by four times the logarithm (base 2) of the number along one side plus the other's.
 
     Returns:
-        How many lookups there are on the two sides along b, inside, and on the two along a (9, 3). And for each lookup,
-        in this order, its place along a and along b, from −½ to ½, and its weight (9, 32, 3).
+        How many lookups there are on the two sides along b, inside, and on the two along a (16, 3). And for each
+        lookup, in this order, its place along a and along b, from −½ to ½, and its weight (16, 36, 3).
     """
-    numbers, taps = np.zeros((9, 3), np.int64), np.zeros((9, 32, 3), np.float32)
-    for q in range(9):
-        count_a, count_b = 2 ** (q // 3), 2 ** (q % 3)
+    numbers, taps = np.zeros((16, 3), np.int64), np.zeros((16, MOST + ON_SIDES, 3), np.float32)
+    for q in range(16):
+        count_a, count_b = 2 ** (q // 4), 2 ** (q % 4)
+        if count_a * count_b > MOST:
+            continue
         along_a, along_b = ((np.arange(n) + 0.5) / n - 0.5 for n in (count_a, count_b))
         ends = (-0.5, 0.5)
         of_a = [(end, t, 2 * end / count_b) for end in ends for t in along_b if count_a > 1]
@@ -142,10 +147,15 @@ def _sides(du_dx, dv_dx, du_dy, dv_dy, height, width):
     ax, ay, bx, by = du_dx * width, -dv_dx * height, du_dy * width, -dv_dy * height
     a, b = np.sqrt(ax * ax + ay * ay), np.sqrt(bx * bx + by * by)
     known = a + b < FAR  # Neither infinite nor NaN.
-    of_a = 0 if a <= NARROW or not known else 3 if a <= WIDE else 6
-    of_b = 0 if b <= NARROW or not known else 1 if b <= WIDE else 2
-    none = 0 * width
-    return (ax, ay, bx, by, of_a + of_b) if known else (none, none, none, none, 0)
+    of_a, of_b, none = _exponent(a), _exponent(b), 0 * width
+    of_a, of_b = (of_a if of_b < 2 else min(of_a, 2)), (of_b if of_a < 2 else min(of_b, 2))
+    return (ax, ay, bx, by, 4 * of_a + of_b) if known else (none, none, none, none, 0)
+
+
+@compiled
+def _exponent(length):
+    """The logarithm (base 2) of the number of lookups along a side of so many texels."""
+    return 0 if length <= NARROW else 1 if length <= WIDE else 2 if length <= 2 * WIDE else 3
 
 
 @compiled
@@ -172,7 +182,7 @@ def _found(x, y, height, width, first, wrap_u, wrap_v, nearest):
 @compiled
 def _kind(ax, ay, bx, by, q):
     """1 if a footprint's sides along b tell how the mean changes along a, plus 2 if those along a tell it along b."""
-    a, b = q >= 3, q % 3 > 0
+    a, b = q >= 4, q % 4 > 0
     determinant, aa, bb = ax * by - ay * bx, ax * ax + ay * ay, bx * bx + by * by
     if a and b and determinant * determinant <= np.float32(SHEARED) * aa * bb:
         a, b = aa >= bb, aa < bb

@@ -110,7 +110,7 @@ def level_of(footprint: Array, size: tuple[int, int]) -> Array:
     """The levels (N,) of `mip_levels` to average footprints in, real numbers, without derivative.
 
     0 is the texture itself, the last a single texel. A footprint is 2.5 of a level's texels along its shorter axis, if
-    it has at most five along the longer one: the mean of two lookups a side then spreads as widely as the footprint.
+    it has at most eight along the longer one: the mean of lookups then spreads about as widely as the footprint.
 
     Args:
         footprint: (N, 4), see `sample_texture`.
@@ -125,7 +125,7 @@ def level_of(footprint: Array, size: tuple[int, int]) -> Array:
     radius = xp.sqrt(half * half + product * product)
     # The squares of the longer and of the shorter axis.
     longer, shorter = middle + radius, xp.clip(middle - radius, 0.0, None)
-    texel = xp.maximum(xp.maximum(shorter / TEXELS**2, longer / (2 * TEXELS) ** 2), xp.ones_like(middle))
+    texel = xp.maximum(xp.maximum(shorter / TEXELS**2, longer / (3.2 * TEXELS) ** 2), xp.ones_like(middle))
     return xp.clip(0.5 * xp.log2(texel), 0.0, float(coarsest))
 
 

@@ -81,11 +81,11 @@ def test_a_footprint_is_a_few_texels_of_its_level():
     x, y = (other[:, i : i + 1] * along + (1 - 2 * i) * other[:, 1 - i : 2 - i] * across for i in (0, 1))
     texel = 2 ** level_of(np.concatenate([x, y], axis=1) / [64, 16, 64, 16], (16, 64))
     coarse = (texel > 1) & (texel < 64)
-    slender = longer > 2 * shorter
+    slender = longer > 3.2 * shorter
     assert (slender & coarse).sum() > 50 and (~slender & coarse).sum() > 20
     np.testing.assert_allclose((shorter / texel)[coarse & ~slender], 2.5, rtol=1e-6)
-    np.testing.assert_allclose((longer / texel)[coarse & slender], 5, rtol=1e-6)
-    assert (longer[texel == 1] <= 5 + 1e-9).all()
+    np.testing.assert_allclose((longer / texel)[coarse & slender], 8, rtol=1e-6)
+    assert (longer[texel == 1] <= 8 + 1e-9).all()
 
 
 def test_wild_footprints_have_a_level():
@@ -113,12 +113,13 @@ def test_lookup_is_linear_between_levels(target):
 
 @pytest.mark.parametrize("target", ALL)
 def test_footprints_are_means_of_lookups_side_by_side(target):
-    texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (60, 2))
-    footprint = RNG.uniform(-1, 1, (60, 4)) * np.exp(RNG.uniform(-4, 0, (60, 1)))
+    texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (200, 2))
+    footprint = RNG.uniform(-1, 1, (200, 4)) * np.exp(RNG.uniform(-4, 0.3, (200, 2))).repeat(2, axis=1)
     a, b = footprint[:, :2], footprint[:, 2:]
-    counts = [np.select([n <= 0.5, n <= 5], [1, 2], 4) for n in (np.hypot(*(x * [10, 12]).T) for x in (a, b))]
-    assert {(1, 1), (2, 2), (2, 4), (4, 4)} <= set(zip(*counts, strict=True))
-    expected = np.zeros((60, 3))
+    counts = [np.select([n <= 0.5, n <= 3, n <= 6], [1, 2, 4], 8) for n in (np.hypot(*(x * [10, 12]).T) for x in (a, b))]
+    counts = [np.where(other >= 4, np.minimum(own, 4), own) for own, other in (counts, counts[::-1])]
+    assert {(1, 1), (2, 2), (2, 4), (4, 4), (8, 2)} <= set(zip(*counts, strict=True))
+    expected = np.zeros((200, 3))
     for n, (i, j) in enumerate(zip(*counts, strict=True)):
         s, t = (((np.arange(m) + 0.5) / m - 0.5)[:, None] for m in (i, j))
         places = (uv[n] + s * a[n])[:, None] + t * b[n]
@@ -293,15 +294,17 @@ def test_more_samples_have_smaller_footprints():
 
 
 @pytest.mark.parametrize("target", ALL)
-def test_a_texture_of_4_x_4_texels_a_pixel_is_averaged_exactly(target):
+def test_a_texture_of_4_x_4_texels_a_pixel_is_averaged(target):
     texture = RNG.random((80, 96, 3))
     theta = {"texture": texture, "uv": CORNERS}
     part = mesh_part(quad(-2.4, 2.4, -2, 2), theta=theta, shader=Textured(mip=True))
     found = show(arrays(target, part), arrays(target, FRONT), splatter="none")[..., :3]
-    # Sixteen samples a pixel lie on the centres of its texels.
-    brute = show(part.replace(shader="textured"), FRONT, splatter="none", supersample=4)[..., :3]
-    np.testing.assert_allclose(brute, texture.reshape(20, 4, 24, 4, 3).mean(axis=(1, 3)), atol=1e-4)
-    np.testing.assert_allclose(found, brute, atol=1e-3)
+    # Sixteen lookups a pixel lie on the centres of its texels.
+    plain = show(arrays(target, part.replace(shader="textured")), arrays(target, FRONT), splatter="none")[..., :3]
+    np.testing.assert_allclose(plain, texture.reshape(20, 4, 24, 4, 3).mean(axis=(1, 3)), atol=1e-4)
+    # Mipmaps are the mean of this and of a level of 2 x 2 texels.
+    brute = show(part.replace(shader="textured"), FRONT, splatter="none", supersample=16)[..., :3]
+    assert np.sqrt(np.mean((found - brute) ** 2)) < 0.25 * np.std(brute)
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -323,26 +326,23 @@ def test_what_a_texture_cuts_out_has_smooth_edges():
         part = mesh_part(quad(), shader=shader, theta={"texture": disk, "uv": CORNERS})
         return show(part, EYE, size=(40, 48), supersample=supersample)[..., 3]
 
-    true = alpha(16)
+    true = alpha(64)
     edge = (true > 0.02) & (true < 0.98)
     plain, smooth = (np.sqrt(np.mean((found - true)[edge] ** 2)) for found in (alpha(), alpha(mip=True)))
-    assert plain > 0.2 and smooth < 0.06, (plain, smooth)
+    assert plain < 0.06 and smooth < 0.06, (plain, smooth)
 
 
-def test_a_checker_floor_is_nearer_to_its_average():
+def test_a_checker_floor_is_its_average():
     checker = (np.indices((32, 32)).sum(axis=0) % 2)[..., None] * np.ones(3, np.float32)
     size = (40, 48)
     plain, mip = (floor(checker, (2, 5.5), shader=Textured(mip=m)) for m in (False, True))
-    brute = show(plain, EYE, size, splatter="none", supersample=16)
+    brute = show(plain, EYE, size, splatter="none", supersample=32)
     error = [np.sqrt(np.mean((show(p, EYE, size, splatter="none") - brute)[..., :3] ** 2)) for p in (plain, mip)]
-    assert error[1] < 0.6 * error[0]
-    # With 2 x 2 samples a pixel less of it is averaged twice.
-    finer = show(mip, EYE, size, splatter="none", supersample=2)
-    assert np.sqrt(np.mean((finer - brute)[..., :3] ** 2)) < 0.6 * error[1]
+    assert error[0] < 0.05 and error[1] < 0.05, error
 
 
-@pytest.mark.parametrize("degrees, most", [(0, 0.4), (60, 0.2), (75, 0.12), (80, 0.12)])
-def test_slanted_smooth_textures_are_nearer_to_their_average(degrees, most):
+@pytest.mark.parametrize("degrees, most", [(0, 0.007), (60, 0.006), (75, 0.009), (80, 0.012), (85, 0.015)])
+def test_slanted_smooth_textures_are_their_average(degrees, most):
     y, x = np.mgrid[:128, :128] / 128 * 2 * np.pi
     texture = 0.5 + 0.25 * (np.cos(12 * x + 5 * y) + np.cos(9 * y - 4 * x))[..., None] * np.ones(3)
     slope, reach = np.radians(degrees), 1.5 / np.cos(np.radians(degrees))
@@ -352,13 +352,8 @@ def test_slanted_smooth_textures_are_nearer_to_their_average(degrees, most):
     camera, size = Camera.look_at((0, 0, 9), (0, 0, 0), fov_y=10), (32, 32)
     brute = show(plane.replace(shader="textured"), camera, size, splatter="none", supersample=16)
     inside = brute[..., 3] > 0.999
-    errors = [
-        np.sqrt(
-            np.mean((show(plane.replace(shader=Textured(mip=m)), camera, size, splatter="none") - brute)[inside] ** 2)
-        )
-        for m in (False, True)
-    ]
-    assert inside.sum() > 500 and errors[1] < most * errors[0], errors
+    found = show(plane.replace(shader=Textured(mip=True)), camera, size, splatter="none")
+    assert inside.sum() > 500 and np.sqrt(np.mean((found - brute)[inside] ** 2)) < most
 
 
 def test_a_texture_of_one_colour_stays_as_it_is():
