@@ -186,9 +186,7 @@ def low(x: np.ndarray) -> np.ndarray:
     return gaussian_filter(x, (2, 2, 0))
 
 
-def truth(
-    scene: SceneAt, samples: int = SAMPLES, size: tuple[int, int] = SIZE
-) -> tuple[np.ndarray, np.ndarray]:
+def truth(scene: SceneAt, samples: int = SAMPLES, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
     """The area-sampled image, and the difference of two a pixel of motion."""
 
     def area(t: float) -> np.ndarray:

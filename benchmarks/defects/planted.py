@@ -309,11 +309,18 @@ ARRAYS = [
         "camera camera_invariants",
     ),
     Defect(
-        "textures are read half a texel off",
+        "textures have green for blue",
         "rts/operations/texels_loops.py",
-        "x, y = uv[n, 0] * real(width) - half,",
-        "x, y = uv[n, 0] * real(width),",
+        "out[n, 0], out[n, 1], out[n, 2] = red, green, blue",
+        "out[n, 0], out[n, 1], out[n, 2] = red, blue, green",
         "shading mipmaps",
+    ),
+    Defect(
+        "a footprint's sides tell half of how the mean changes",
+        "rts/operations/texels_loops.py",
+        "by = share * (of_a if i < sides else of_b)",
+        "by = 0.5 * share * (of_a if i < sides else of_b)",
+        "mipmaps",
     ),
     Defect(
         "odd sizes of textures lose their last line",

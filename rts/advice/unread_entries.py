@@ -6,10 +6,10 @@ import difflib
 from collections.abc import Collection, Sequence
 
 from rts.contracts.checked_parts import CheckedPart
+from rts.contracts.gbuffer import FOOTPRINT
 from rts.errors import InputWarning, warn
 from rts.shading.tangents import TANGENT
 from rts.shading.textures import MAPS, own_uv
-from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = (

@@ -9,6 +9,9 @@ from typing import Any
 from rts.errors import InputError
 from rts.operations.unit import unit
 
+FOOTPRINT, STEPS = "uv_footprint", "uv_steps"
+"""Names of attributes; see `GBuffer`."""
+
 
 class GBuffer(dict):
     """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
@@ -20,7 +23,9 @@ class GBuffer(dict):
     Built-in surfaces use the names position, normal, uv and color. Meshes, whose normals are interpolated, also give
     "face_normal" (N, 3), that of the triangle on either side, of any length. If there is "uv",
     shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
-    ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent" (N,
+    ∂v/∂y, the change to the cell below; without derivative. A surface that gives "uv_steps" (N, 10), constant, saves
+    two evaluations for it: how position, in local space, changes along both parameters of a sample, three numbers each,
+    then how uv does. If there are "uv" and "normal", they receive "tangent" (N,
     4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal ×
     tangent. Coordinates of normal maps alone, "uv_normal_map", take the place of "uv" there.
     """

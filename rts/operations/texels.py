@@ -33,8 +33,9 @@ def texels(
     """Bilinear lookups (N, C), differentiable in the table and in uv.
 
     Over a footprint they are the mean of lookups at one place along a side of up to half a texel, at two along one of
-    up to three texels, at four up to six, and at eight beyond, if there are at most 16 of all. The derivative in uv is that of the footprint's mean, by as many
-    lookups along each of its sides; where a side has one lookup, by the mean of the slopes there.
+    up to three texels, at four up to six, and at eight beyond, if there are at most 16 of all. The derivative in uv is
+    that of the footprint's mean, by as many lookups along each of its sides; where a side has one lookup, by the mean
+    of the slopes there.
 
     Args:
         table: (M, C) float, the texels of all images, row by row, the uppermost first.
@@ -65,71 +66,20 @@ def _specification(
     wrap: tuple[str, str],
     filter: str,
 ) -> Array:
-    xp, options = namespace(table, uv), {"sizes": sizes, "wrap": wrap, "filter": filter}
+    options: dict[str, Any] = {"sizes": sizes, "wrap": wrap, "filter": filter}
     if not footprint.shape[0]:
         return _points(table, uv, image, **options)[0]
-    from rts.operations.texels_loops import FAR, MOST, NARROW, ON_SIDES, SHEARED, WIDE
+    from rts.operations.texels_means import means
 
-    still, height, width = stopped(uv), *_places(uv, image, sizes)[:2]
-    a, b = ((footprint[:, i] * width, -footprint[:, i + 1] * height) for i in (0, 2))  # Right and down, in texels.
-    lengths = [xp.sqrt(x * x + y * y) for x, y in (a, b)]
-    known = lengths[0] + lengths[1] < FAR
-    footprint = xp.where(known[:, None], footprint, 0.0)
-    (ax, ay), (bx, by) = ([xp.where(known, x, 0.0)[:, None] for x in side] for side in (a, b))
-    one = xp.ones_like(lengths[0])
-    fit = [
-        xp.where(
-            x > NARROW, xp.where(x > WIDE, xp.where(x > 2 * WIDE, 3 * one, 2 * one), one), 0 * one
-        )
-        for x in lengths
-    ]
-    fit = [xp.where(other >= 2, xp.clip(own, None, 2), own) for own, other in (fit, fit[::-1])]
-    count_a, count_b = (xp.where(known, 2**x, 1.0) for x in fit)
+    height, width = places(uv, image, sizes)[:2]
 
-    def looked_up(places: list[tuple[Array, Array]], shares: list[Array]) -> list[Array]:
-        """Sums of lookups, and of slopes right and down, at places along both sides, times shares."""
-        at = xp.concat([still + s[:, None] * footprint[:, :2] + t[:, None] * footprint[:, 2:] for s, t in places])
-        share, number = xp.concat(shares)[:, None], xp.concat([image] * len(places))
-        found = _points(table, at, number, **options)
-        return [xp.sum(xp.reshape(share * x, (len(places), *still.shape[:1], -1)), axis=0) for x in found]
+    def looked_up(place: Array, number: Array) -> tuple[Array, Array, Array]:
+        return _points(table, place, number, **options)
 
-    def along(i: Array, count: Array) -> Array:
-        return (xp.clip(i, None, count - 1) + 0.5) / count - 0.5
-
-    within = [(xp.floor(i / count_b), i - xp.floor(i / count_b) * count_b) for i in range(MOST)]
-    mean, right, down = looked_up(
-        [(along(i, count_a), along(j, count_b)) for i, j in within],
-        [xp.where(i < count_a, 1 / (count_a * count_b), 0.0) for i, _ in within],
-    )
-    if filter == "nearest":
-        return mean
-    wide_a, wide_b = count_a > 1, count_b > 1
-    of_a, places, shares = xp.where(wide_a, 2 * count_b, 0.0), [], []
-    for i in range(ON_SIDES):  # Those on the two sides along b, then on those along a.
-        on_a, j = i < of_a, xp.where(i < of_a, i * one, i - of_a)
-        end, j = j - 2 * xp.floor(j / 2) - 0.5, xp.floor(j / 2)
-        places.append((xp.where(on_a, end, along(j, count_a)), xp.where(on_a, along(j, count_b), end)))
-        there = on_a | (wide_b & (j < count_a))
-        shares.append(xp.where(there, 2 * end / xp.where(on_a, count_b, count_a), 0.0))
-    rises = []
-    for first in (True, False):
-        chosen = [xp.where((i < of_a) == first, share, 0.0) for i, share in enumerate(shares)]
-        rises.append(looked_up(places, chosen)[0])
-    more_a, more_b = rises[0] - right * ax - down * ay, rises[1] - right * bx - down * by
-    determinant, square_a, square_b = ax * by - ay * bx, ax * ax + ay * ay, bx * bx + by * by
-    wide_a, wide_b = wide_a[:, None], wide_b[:, None]
-    both = wide_a & wide_b & (determinant * determinant > SHEARED * square_a * square_b)
-    by_a = wide_a & (both | ~wide_b | (square_a >= square_b))
-    by_b = wide_b & (both | ~wide_a | (square_a < square_b))
-    more_a = xp.where(by_a, more_a / xp.where(by_a, xp.where(both, determinant, square_a), 1.0), 0.0)
-    more_b = xp.where(by_b, more_b / xp.where(by_b, xp.where(both, determinant, square_b), 1.0), 0.0)
-    right = right + more_a * xp.where(both, by, ax) + more_b * xp.where(both, -ay, bx)
-    down = down + more_a * xp.where(both, -bx, ay) + more_b * xp.where(both, ax, by)
-    moved = uv - still
-    return mean + right * (moved[:, :1] * width[:, None]) - down * (moved[:, 1:] * height[:, None])
+    return means(looked_up, uv, image, footprint, height, width, filter == "nearest")
 
 
-def _places(uv: Array, image: Array, sizes: tuple[tuple[int, ...], ...]) -> tuple[Array, Array, Any, Any]:
+def places(uv: Array, image: Array, sizes: tuple[tuple[int, ...], ...]) -> tuple[Array, Array, Any, Any]:
     """Height, width, texels from row to row, and the first texel of the image of each lookup (N,)."""
     xp = namespace(uv)
     if not image.shape[0]:
@@ -153,7 +103,7 @@ def _points(
 ) -> tuple[Array, Array, Array]:
     """Lookups (N, C) at points, and the slopes there, to the right and down, a texel each."""
     xp = namespace(table, uv)
-    height, width, step, first = _places(uv, image, sizes)
+    height, width, step, first = places(uv, image, sizes)
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     if filter == "nearest":
         x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
@@ -214,7 +164,15 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 
 
 TEXELS = Operation.of_loops(
-    "rts.texels", _specification, (2, 2, 1, 2), _shape, _loops, _check, differentiable=2, packed=(1,), packed_result=True
+    "rts.texels",
+    _specification,
+    (2, 2, 1, 2),
+    _shape,
+    _loops,
+    _check,
+    differentiable=2,
+    packed=(1,),
+    packed_result=True,
 )
 """The operation of `texels`, on table (M, C), uv (N, 2), numbers of images (N,), or (0,) where all are the first, and
 footprints (N, 4), or (0, ·) for points.

@@ -1,6 +1,7 @@
 """Bilinear lookups in tables of texels, and their derivatives, as compiled loops for arrays on the host.
 
-Operands are those of `rts.operations.texels.TEXELS`. Gradients of texels are added up in the order of the lookups.
+Operands are those of `rts.operations.texels.TEXELS`. Loops begin alike, since a helper that took the arrays would take
+as long as a lookup. Gradients of texels are added up in the order of the lookups.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Lookups(NamedTuple):
 
 
 def _taps() -> tuple[np.ndarray, np.ndarray]:
-    """Where footprints are looked up, by four times the logarithm (base 2) of the number along one side plus the other's.
+    """Where footprints are looked up, by the numbers of lookups along both sides: 2ᵃ and 2ᵇ are of 4 a + b.
 
     Returns:
         How many lookups there are on the two sides along b, inside, and on the two along a (16, 3). And for each

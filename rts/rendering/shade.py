@@ -14,7 +14,7 @@ from rts.arrays.engine_base import Engine
 from rts.arrays.engines import Context, is_constant
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.gbuffer import GBuffer
+from rts.contracts.gbuffer import FOOTPRINT, GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.result_checks import check_attribute, check_shaded
 from rts.errors import InputError
@@ -22,7 +22,6 @@ from rts.rendering.part_transforms import OneTransform, ViewTransforms
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.tangents import OWN_UV, TANGENT, tangents
-from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
@@ -77,7 +76,13 @@ def add_footprint(
     Samples of another number of parameters than two have none. Other arguments are as in `uv_footprint`.
     """
     if "uv" in local and FOOTPRINT not in local and samples.params.shape[-1] == 2:
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, rows, view, *context))
+
+        def footprint() -> Array:
+            from rts.shading.uv_footprints import uv_footprint
+
+            return uv_footprint(part.surface, part.read, samples, local, rows, view, *context)
+
+        local.defer(FOOTPRINT, footprint)
 
 
 def shade(

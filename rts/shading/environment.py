@@ -11,7 +11,6 @@ from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.operations.texels import texels
 from rts.shading.spherical_harmonics import harmonics
-from rts.shading.textures import mip_levels
 from rts.shading.theta_entries import check_entry, shape_of
 
 ROWS = 128
@@ -45,6 +44,8 @@ def prefiltered(image: Array) -> dict[str, Array]:
     shape = shape_of(image)
     check_entry("['light']['environment']", image, "(h, w, 3)", len(shape) == 3 and shape[2] == 3 and 0 not in shape)
     xp, engine = namespace(image), engine_of(image)
+    from rts.shading.mipmaps import mip_levels
+
     small = next(x for x in reversed(mip_levels(image)) if x.shape[0] >= ROWS or x.shape == image.shape)
     grid = engine.constant(_directions().reshape(-1, 3), image)
     middle = xp.reshape(_looked_up(small, grid), (ROWS, 2 * ROWS, 3))

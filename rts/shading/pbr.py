@@ -10,7 +10,7 @@ from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, dot, shape_of
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.gbuffer import GBuffer
+from rts.contracts.gbuffer import FOOTPRINT, GBuffer
 from rts.errors import InputError
 from rts.operations.unit import unit
 from rts.scene.camera import Camera
@@ -21,7 +21,6 @@ from rts.shading.shaders import Unlit, is_behind
 from rts.shading.tangents import TANGENT, tangent_frame
 from rts.shading.textures import MAPS, Wrap, check_sampler, own_uv, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
-from rts.shading.uv_footprints import FOOTPRINT
 
 DIELECTRIC = 0.04
 """The reflectance of dielectrics at normal incidence."""

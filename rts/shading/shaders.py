@@ -23,7 +23,7 @@ from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, dot, shape_of
 from rts.arrays.engines import namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree
-from rts.contracts.gbuffer import GBuffer
+from rts.contracts.gbuffer import FOOTPRINT, GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
 from rts.operations.unit import unit
@@ -32,7 +32,6 @@ from rts.scene.row_cameras import RowCameras
 from rts.shading.light import light_of
 from rts.shading.textures import Wrap, check_sampler, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
-from rts.shading.uv_footprints import FOOTPRINT
 
 DEFAULT_SPECULAR, DEFAULT_SHININESS = 0.3, 32.0
 

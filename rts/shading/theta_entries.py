@@ -42,7 +42,7 @@ def check_entry(entry: str, value: Any, expected: str, ok: bool) -> Any:
 
 
 def check_base(name: str, base: Array) -> None:
-    """Refuse base colours (N, C) of `BRIGHTEST` or more; what is not finite is, with the shader's result, by its cause."""
+    """Refuse base colours (N, C) of `BRIGHTEST` or more; others that are not finite are refused with the result."""
     if not is_finite(base, below=BRIGHTEST):
         values = value_of(base)
         if values is not None and np.isfinite(values).all():

@@ -11,14 +11,13 @@ from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import parallel, read_only
+from rts.contracts.gbuffer import FOOTPRINT, STEPS
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
 from rts.operations.linear import affine_map, affine_map_of_views
 from rts.operations.operation import known_value
 from rts.shading.parameter_steps import check_two_parameters, steps_beside
 
-FOOTPRINT, STEPS = "uv_footprint", "uv_steps"
-"""Names of attributes in the G-buffer."""
 LEAST = 1e-30
 """Smallest divisor; numbers of smaller absolute value are replaced by it."""
 
@@ -81,9 +80,7 @@ def uv_footprint(
     return xp.astype(xp.concat([along_x, along_y], axis=1) / determinant, uv.dtype)
 
 
-def _steps(
-    surface: Surface, theta: Mapping[str, Tree], samples: Samples, position: Array, uv: Array
-) -> Array:
+def _steps(surface: Surface, theta: Mapping[str, Tree], samples: Samples, position: Array, uv: Array) -> Array:
     """The attribute "uv_steps" (N, 10) of `rts.GBuffer`, by evaluations of the surface beside its samples."""
     moves, changes = zip(*steps_beside(surface, theta, samples, position, uv), strict=True)
     return namespace(position).concat([*moves, *changes], axis=1)

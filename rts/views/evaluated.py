@@ -12,13 +12,12 @@ from rts.arrays.engine_base import Engine
 from rts.arrays.engines import Context
 from rts.arrays.trees import Array, leaves
 from rts.contracts.checked_parts import CheckedPart
-from rts.contracts.gbuffer import GBuffer
+from rts.contracts.gbuffer import FOOTPRINT, GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.shader import Shader
 from rts.rendering.shade import add_footprint, evaluate, split_by_view
 from rts.rendering.splats import concatenated
 from rts.shading.tangents import OWN_UV, TANGENT
-from rts.shading.uv_footprints import FOOTPRINT
 
 
 class Evaluated(NamedTuple):

@@ -328,8 +328,16 @@ def cases():
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
         "unit": (UNIT, [points], {}),
         "texels": (TEXELS, [table, uv, image, over], {**sizes, "wrap": ("repeat", "mirror"), "filter": "linear"}),
-        "texels of one": (TEXELS, [table, uv, image[:0], over[:0]], {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"}),
-        "nearest texels": (TEXELS, [table, uv, image, over], {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"}),
+        "texels of one": (
+            TEXELS,
+            [table, uv, image[:0], over[:0]],
+            {**sizes, "wrap": ("clamp", "repeat"), "filter": "linear"},
+        ),
+        "nearest texels": (
+            TEXELS,
+            [table, uv, image, over],
+            {**sizes, "wrap": ("mirror", "clamp"), "filter": "nearest"},
+        ),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 

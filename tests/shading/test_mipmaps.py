@@ -23,8 +23,9 @@ from rts.contracts.records import Cells
 from rts.errors import InputError
 from rts.operations.texels import TEXELS
 from rts.plugin_api.records import Samples
+from rts.shading.mipmaps import level_of, mip_levels
 from rts.shading.shaders import Textured
-from rts.shading.textures import level_of, mip_levels, sample_texture
+from rts.shading.textures import sample_texture
 from rts.shading.uv_footprints import uv_footprint
 
 pytestmark = pytest.mark.rendering
@@ -116,7 +117,9 @@ def test_footprints_are_means_of_lookups_side_by_side(target):
     texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (200, 2))
     footprint = RNG.uniform(-1, 1, (200, 4)) * np.exp(RNG.uniform(-4, 0.3, (200, 2))).repeat(2, axis=1)
     a, b = footprint[:, :2], footprint[:, 2:]
-    counts = [np.select([n <= 0.5, n <= 3, n <= 6], [1, 2, 4], 8) for n in (np.hypot(*(x * [10, 12]).T) for x in (a, b))]
+    counts = [
+        np.select([n <= 0.5, n <= 3, n <= 6], [1, 2, 4], 8) for n in (np.hypot(*(x * [10, 12]).T) for x in (a, b))
+    ]
     counts = [np.where(other >= 4, np.minimum(own, 4), own) for own, other in (counts, counts[::-1])]
     assert {(1, 1), (2, 2), (2, 4), (4, 4), (8, 2)} <= set(zip(*counts, strict=True))
     expected = np.zeros((200, 3))
@@ -138,7 +141,9 @@ def test_the_derivative_in_uv_is_that_of_the_mean(target, mip):
     footprint = np.tile([2.0 / 64, 0.5 / 48, -0.6 / 64, 2.4 / 48], (200, 1))
     on = arrays(target, (texture, footprint))
     of_steps, of_ramp = (
-        gradient(target, lambda x, k=k: sample_texture(on[0], x, "repeat", on[1], mip=mip)[:, k].sum(), arrays(target, uv))
+        gradient(
+            target, lambda x, k=k: sample_texture(on[0], x, "repeat", on[1], mip=mip)[:, k].sum(), arrays(target, uv)
+        )
         for k in (0, 1)
     )
     np.testing.assert_allclose(of_ramp, np.tile([0, 48 / 47], (200, 1)), atol=2e-3)
