@@ -57,12 +57,18 @@ def lines() -> dict[str, tuple[int, Scene]]:
         "card, 5°": (48, lambda t: mesh((card + [t * pixel(48), 0, 0]).astype(np.float32), TWO))
     }
     for name, file in (("spot", "spot/spot_triangulated"), ("teapot", "teapot")):
-        vertices, faces = meshes.mesh(file)
+        vertices, faces = welded(*meshes.mesh(file))
         scenes[name] = (
             128,
             lambda t, v=vertices, f=faces: mesh((v + [t * pixel(128), 0, 0]).astype(np.float32), f, "lambert"),
         )
     return scenes
+
+
+def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh without copies of vertices, which files have at seams of uv, and where smooth normals would have seams."""
+    vertices, first = np.unique(vertices.round(7), axis=0, return_inverse=True)
+    return vertices, first.reshape(-1)[faces]
 
 
 def along(size: int, scene: Scene, splatter: str) -> dict[str, Any]:

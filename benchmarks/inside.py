@@ -31,13 +31,15 @@ UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
 WORDS = "the image of a scene is a sparse matrix times the colours of samples "
 
 
-def text(size: int = 256) -> np.ndarray:
-    """A page of black letters on white, (size, size, 3), linear."""
+def text(size: int = 256, margin: int = 24) -> np.ndarray:
+    """A page of black letters on white, (size, size, 3), linear; without a margin letters are cut at its edges."""
     page = Image.new("L", (size, size), 255)
     draw, line, font = ImageDraw.Draw(page), 34, ImageFont.load_default(30)
     for i in range(size // line + 1):
         draw.text((3 - 7 * (i % 5), line * i - 4), WORDS[7 * i % 40 :] + WORDS, fill=0, font=font)
-    return np.repeat(np.asarray(page, np.float32)[..., None] / 255, 3, axis=2)
+    grey = np.asarray(page, np.float32)[..., None] / 255
+    inside = np.pad(np.ones((size - 2 * margin,) * 2), margin)[..., None]
+    return np.repeat(np.where(inside, grey, 1), 3, axis=2).astype(np.float32)
 
 
 def checkers(squares: int = 8, texels: int = 32) -> np.ndarray:
@@ -97,6 +99,7 @@ def scenes() -> dict[str, tuple[SceneAt, tuple[int, int]]]:
     each = np.arange(len(flat)).reshape(-1, 3)
     return {
         "text, uv shifts": (plane(text()), SIZE),
+        "text without a margin, uv shifts": (plane(text(margin=0)), SIZE),
         "text of twice the texels, uv shifts": (plane(text(512)), SIZE),
         "checkers, uv shifts": (plane(checkers()), SIZE),
         "checkers, mip, uv shifts": (plane(checkers(), rts.plugin("shaders", "textured")(mip=True)), SIZE),

@@ -324,7 +324,7 @@ ARRAYS = [
     ),
     Defect(
         "odd sizes of textures lose their last line",
-        "rts/shading/textures.py",
+        "rts/shading/mipmaps.py",
         "(part + 1 / n) * x[2::2, ...]",
         "(part + 0 / n) * x[2::2, ...]",
         "mipmaps",

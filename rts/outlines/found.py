@@ -35,7 +35,8 @@ class Outlines(NamedTuple):
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
         kind: (B,) int32, `edge_kinds.BEFORE_ENDS`, BEHIND_ENDS or INTERSECT; BEFORE_ENDS at seams, where a surface goes
             on and its colours may change. Of several layers it is about the one that ends there.
-        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `kind` is INTERSECT; else 0.
+        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `kind` is INTERSECT; of the one
+            that ends, where the near or the far plane cuts it; else 0.
         ends: (B, 2) bool: is this the gap's first crossing, and its last?
         segments: see `Segments`.
         joined: (2, H, W) bool, see `Stencil`.

@@ -7,8 +7,8 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
 from rts.outlines.seen_mesh_loops import on_edges, plane_at
-from rts.outlines.tolerances import PARALLEL, TOUCH
-from rts.sampling.points_loops import corners_of, edge
+from rts.outlines.tolerances import CUT, PARALLEL, TOUCH
+from rts.sampling.points_loops import corners_of, edge, weights_at
 
 ANY_SIZE = 6
 """The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
@@ -223,7 +223,8 @@ def edges(first, last, kind, parts, triangles, points, mesh, slope, depth, tange
         triangles: (B, 2 or more), alike.
         points: (B, 2), where crossings are.
         mesh: the triangles of these parts, a `SeenMesh`.
-        slope: (B, 2, 2) to fill where surfaces intersect: slopes of depth along x and y, a cell.
+        slope: (B, 2, 2) to fill where surfaces intersect, or the near or far plane cuts the one that ends: slopes of
+            depth along x and y, a cell.
         depth: (B,) to fill: of the surface that ends, or where surfaces intersect.
         tangent: (B, 2) to fill: along the nearest edge of the triangle that ends, or of the one before.
     """
@@ -236,13 +237,34 @@ def edges(first, last, kind, parts, triangles, points, mesh, slope, depth, tange
             if not (own[0] <= parts[b, side] < own[1] and (ends or kind[b] == INTERSECT)):
                 continue
             sign = corners_of(triangles[b, side], rows, vertices, faces, corners)
-            if kind[b] == INTERSECT:
+            cut = (
+                kind[b] != INTERSECT
+                and sign != 0
+                and _is_cut(triangles[b, side], vertices, faces, mesh.clip, corners, sign, x, y)
+            )
+            if kind[b] == INTERSECT or cut:
                 # Not a number where a triangle is seen edge-on.
                 depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
             else:
                 depth[b] = on_edges(corners, x, y)[0]
-            if ends:
+            if cut:
+                tangent[b, 0], tangent[b, 1] = slope[b, side, 1], -slope[b, side, 0]
+            elif ends:
                 tangent[b, 0], tangent[b, 1] = _nearest_edge(corners, sign, x, y)
+
+
+@compiled
+def _is_cut(t, vertices, faces, clip, corners, sign, x, y):
+    """True if a triangle crosses the near or the far plane at a position in the image, where it ends for the camera."""
+    cut, (_, first, second) = False, weights_at(corners, sign, x, y)
+    for p in range(2):
+        low, high, value = np.inf, -np.inf, 0.0
+        for k in range(3):
+            v, share = faces[t, k], (first if k == 0 else second if k == 1 else 1 - first - second)
+            off = clip[p, 3] + clip[p, 0] * vertices[v, 0] + clip[p, 1] * vertices[v, 1] + clip[p, 2] * vertices[v, 2]
+            low, high, value = min(low, off), max(high, off), value + share * off
+        cut |= low < 0 < high and abs(value) <= CUT * (high - low)
+    return cut
 
 
 @compiled(inline="always")
@@ -265,7 +287,7 @@ def finish_directions(width, depth, kind, slope, tangent, away):
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
         depth: (B,), see `edges`.
         kind: (B,), see `edges`; becomes BEFORE_ENDS where slopes of surfaces that intersect hardly differ.
-        slope: (B, 2, 2), see `edges`; becomes 0 but at intersections.
+        slope: (B, 2, 2), see `edges`; becomes 0 where slopes hardly differ.
         tangent: (B, 2), see `edges`.
         away: (B,) to fill with `Crossings.cells_away`.
     """
@@ -277,8 +299,7 @@ def finish_directions(width, depth, kind, slope, tangent, away):
                 tangent[b, 0], tangent[b, 1] = y, -x
             else:
                 kind[b] = BEFORE_ENDS
-        if kind[b] != INTERSECT:
-            slope[b] = 0.0
+                slope[b] = 0.0
         length = np.hypot(tangent[b, 0], tangent[b, 1])
         if length > 0:
             tangent[b, 0], tangent[b, 1] = tangent[b, 0] / length, tangent[b, 1] / length

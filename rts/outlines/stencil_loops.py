@@ -274,13 +274,16 @@ def _of_crossings(outlines, beside, cells):
             for i in range(2):
                 moves[b, i, 0, 0], moves[b, i, 1, 1] = 0.5, 0.5
             continue
-        if kind[b] < INTERSECT:
-            moves[b, kind[b], 0, 0], moves[b, kind[b], 1, 1] = 1.0, 1.0
+        ending = min(kind[b], 1)
+        cut = kind[b] < INTERSECT and (slope[b, ending, 0] != 0 or slope[b, ending, 1] != 0)
+        if kind[b] < INTERSECT and not cut:
+            moves[b, ending, 0, 0], moves[b, ending, 1, 1] = 1.0, 1.0
             continue
+        # A line of intersection; or one of fixed depth, where a plane that does not move cuts a surface.
         square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
         for a in range(2):
             share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
-            for i in range(2):
+            for i in range(ending if cut else 0, ending + 1 if cut else 2):
                 sign = share if i == 0 else -share
                 moves[b, i, 0, a] = -sign * slope[b, i, 0]
                 moves[b, i, 1, a] = -sign * slope[b, i, 1]

@@ -38,6 +38,13 @@ The line between them moves by a cell where one of them comes nearer by so littl
 tells how fast; where it is larger, lines between surfaces that do cross stand still.
 """
 
+CUT = 1e-3
+"""Share of a triangle's extent across the near or the far plane: where it ends so close to the plane, the plane cuts it.
+
+Where it is larger, edges of triangles that only come near the plane stay at its depth; where it is smaller, rounding
+makes cuts move with the surface.
+"""
+
 RISE = 0.2
 """Share of a cell's width by which depths on a surface without triangles may change more than beside: where they change
 by more, it may be another surface, and the gap is searched.
