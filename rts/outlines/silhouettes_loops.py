@@ -8,7 +8,7 @@ from rts.compiling.loops import compiled, loop
 from rts.outlines.edge_kinds import BEFORE_ENDS, BEHIND_ENDS, INTERSECT
 from rts.outlines.seen_mesh_loops import on_edges, plane_at
 from rts.outlines.tolerances import CUT, PARALLEL, TOUCH
-from rts.sampling.points_loops import corners_of, edge, weights_at
+from rts.sampling.points_loops import corners_of, edge
 
 ANY_SIZE = 6
 """The size of triangles that are larger than others, or seen in part. Others have the size n if they are at most
@@ -237,33 +237,33 @@ def edges(first, last, kind, parts, triangles, points, mesh, slope, depth, tange
             if not (own[0] <= parts[b, side] < own[1] and (ends or kind[b] == INTERSECT)):
                 continue
             sign = corners_of(triangles[b, side], rows, vertices, faces, corners)
-            cut = (
-                kind[b] != INTERSECT
-                and sign != 0
-                and _is_cut(triangles[b, side], vertices, faces, mesh.clip, corners, sign, x, y)
-            )
+            # Not a number where a triangle is seen edge-on.
+            deep, along, down = plane_at(corners, sign, x, y)
+            cut = kind[b] != INTERSECT and sign != 0
+            cut = cut and _is_cut(triangles[b, side], vertices, faces, mesh.clip, corners, deep, np.hypot(along, down))
             if kind[b] == INTERSECT or cut:
-                # Not a number where a triangle is seen edge-on.
-                depth[b], slope[b, side, 0], slope[b, side, 1] = plane_at(corners, sign, x, y)
+                depth[b], slope[b, side, 0], slope[b, side, 1] = deep, along, down
             else:
                 depth[b] = on_edges(corners, x, y)[0]
             if cut:
-                tangent[b, 0], tangent[b, 1] = slope[b, side, 1], -slope[b, side, 0]
+                tangent[b, 0], tangent[b, 1] = down, -along
             elif ends:
                 tangent[b, 0], tangent[b, 1] = _nearest_edge(corners, sign, x, y)
 
 
 @compiled
-def _is_cut(t, vertices, faces, clip, corners, sign, x, y):
-    """True if a triangle crosses the near or the far plane at a position in the image, where it ends for the camera."""
-    cut, (_, first, second) = False, weights_at(corners, sign, x, y)
+def _is_cut(t, vertices, faces, clip, corners, depth, slope):
+    """True if a triangle crosses the near or the far plane within `CUT` cells of where it has a depth and a slope."""
+    cut = False
     for p in range(2):
-        low, high, value = np.inf, -np.inf, 0.0
+        low, high, first, last = np.inf, -np.inf, 0.0, 0.0
         for k in range(3):
-            v, share = faces[t, k], (first if k == 0 else second if k == 1 else 1 - first - second)
+            v = faces[t, k]
             off = clip[p, 3] + clip[p, 0] * vertices[v, 0] + clip[p, 1] * vertices[v, 1] + clip[p, 2] * vertices[v, 2]
-            low, high, value = min(low, off), max(high, off), value + share * off
-        cut |= low < 0 < high and abs(value) <= CUT * (high - low)
+            first, low = (corners[k, 3], off) if off < low else (first, low)
+            last, high = (corners[k, 3], off) if off > high else (last, high)
+        at = first - low * (last - first) / (high - low)
+        cut |= low < 0 < high and abs(depth - at) <= CUT * slope
     return cut
 
 

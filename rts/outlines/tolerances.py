@@ -39,10 +39,10 @@ tells how fast; where it is larger, lines between surfaces that do cross stand s
 """
 
 CUT = 1e-3
-"""Share of a triangle's extent across the near or the far plane: where it ends so close to the plane, the plane cuts it.
+"""Cells from where the near or the far plane cuts a triangle: what ends so close to there is the cut, not an edge.
 
-Where it is larger, edges of triangles that only come near the plane stay at its depth; where it is smaller, rounding
-makes cuts move with the surface.
+Where it is larger, edges beside a cut stand still as that does; where it is smaller, rounding makes cuts move with the
+surface.
 """
 
 RISE = 0.2

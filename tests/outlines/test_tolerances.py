@@ -25,7 +25,7 @@ QUAD = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
 RED, GREEN = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
 AROUND = pytest.mark.parametrize("share", [0.7, 1.4])
 """Shares of a number."""
-TOUCH, ALIKE, BESIDE, PARALLEL, RISE = 2e-5, 1e-5, 0.1, 1e-3, 0.2
+TOUCH, ALIKE, BESIDE, PARALLEL, RISE, CUT = 2e-5, 1e-5, 0.1, 1e-3, 0.2, 1e-3
 LARGE, CREASE = 16.0, np.radians(20)
 LONE, ASIDE, ON_ONE_SIDE, OTHER_BEHIND, UNLIKE, FAR = 2.0, 0.4, 1.5, 0.5, 1.0, 4.0
 
@@ -80,6 +80,22 @@ def test_parallel_is_the_turn_between_planes_that_cross(share):
     _, along = pushed(image)
     expected = SIZE / slope if share > 1 else 0.0
     assert along[..., 1].sum() == pytest.approx(expected, rel=0.02, abs=1)
+
+
+@AROUND
+def test_cut_is_how_far_from_a_cut_an_edge_moves_with_the_surface(share):
+    """A card that ends at x = 0.2, and that the near plane cuts a little above a line of centres; it moves along x."""
+    above = share * CUT
+
+    def image(t):
+        rising = card(-9, 0.2, RED, lambda x, y: DEPTH - 1 + y - 0.5 - above, half=2.5)
+        along = torch.eye(4, dtype=torch.float64) + t * torch.tensor(np.outer([1.0, 0, 0, 0], [0, 0, 0, 1.0]))
+        return rts.render(rising.replace(transform=along), CAMERA, (SIZE, SIZE))
+
+    _, along = pushed(image)
+    upper, lower = along[SIZE // 2 - 1, :, 3].sum(), along[SIZE // 2 + 1, :, 3].sum()
+    assert lower == pytest.approx(1, abs=1e-3)
+    assert (upper > 0.45) == (share > 1), upper
 
 
 @AROUND
