@@ -162,8 +162,8 @@ ROWS: tuple[Row, ...] = (
         f"The card moves towards the camera, and the cut across it. {ERROR}",
         Derivative(failure_scenes.through_near, pixel=1.0, mode="tz"),
         (
-            "The edge that the near plane cuts stays where the plane is, while samples move with the "
-            "card: bring the plane nearer."
+            "Samples move with the card, and the edge that the near plane cuts does not: splatters of "
+            "samples move it along. `edges` keeps it at the plane."
         ),
     ),
     Row(
