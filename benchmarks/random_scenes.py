@@ -102,7 +102,8 @@ def drawn(seed: int, known: dict) -> Drawn:
         placed = rng.uniform(0.35, 0.75) * vertices @ turn(*rng.uniform(0, 6, 3)).T + place
         motion = str(rng.choice(MOTIONS)) if i == 0 else "stays"
         names.append(f"{name}, {look}, {motion}")
-        move = moved(placed, motion, rng, pixel) if i == 0 else lambda t, v=tensor(placed): v
+        still = tensor(placed)
+        move = moved(placed, motion, rng, pixel) if i == 0 else lambda t, v=still: v
         made.append(part_of((vertices, faces), look, rng, move))
     if rng.random() < 0.3:
         wall = np.array([[-3, -3, -1.2], [3, -3, -1.6], [3, 3, -1.4], [-3, 3, -1.0]])

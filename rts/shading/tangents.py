@@ -12,7 +12,6 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
 from rts.operations.unit import unit
-from rts.shading.parameter_steps import check_two_parameters, steps_beside
 from rts.shading.textures import own_uv
 
 TANGENT = "tangent"
@@ -44,6 +43,8 @@ def tangents(
     Raises:
         InputError: samples have another number of parameters than two.
     """
+    from rts.shading.parameter_steps import check_two_parameters, steps_beside
+
     check_two_parameters(surface, samples, TANGENT, "normal maps")
     name = OWN_UV if OWN_UV in gbuffer else "uv"
     params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer[name]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, namespace, stopped
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.arrays.trees import Array, Tree
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.gbuffer import FOOTPRINT, STEPS
 from rts.contracts.records import Samples
@@ -53,21 +53,44 @@ def uv_footprint(
         InputError: samples have another number of parameters than two.
     """
     check_two_parameters(surface, samples, FOOTPRINT, "mipmaps")
-    found = _on_host(surface, theta, samples, gbuffer, rows, view)
-    if found is not None:
-        return engine.constant(found, gbuffer["uv"])
     arrays = theta, rows, gbuffer["position"], gbuffer["uv"], samples.params
     theta, rows, position, uv, params = (stopped(constants(x, engine, like)) for x in arrays)
-    xp, rows = namespace(position), rows[..., :3, :]
+    known, samples = gbuffer, replace(samples, params=params)
+    if STEPS not in gbuffer and samples.gbuffer is not None:  # Of a constant surface, with what the shader reads alone.
+        known = surface.evaluate(theta, samples)
+    if STEPS in known:
+        steps = stopped(constants(known[STEPS], engine, like))
+    else:
+        moves, changes = zip(*steps_beside(surface, theta, samples, position, uv), strict=True)
+        steps = namespace(position).concat([*moves, *changes], axis=1)
+    found = _on_host(rows, view, position, steps)
+    return engine.constant(found, uv) if found is not None else _specified(rows[..., :3, :], view, position, steps)
+
+
+def _on_host(rows: Array, view: Array | None, position: Array, steps: Array) -> np.ndarray | None:
+    """The footprints in NumPy, where all that they depend on is at hand; else None."""
+    arrays = [known_value(x) for x in (rows, position, steps)]
+    numbers = np.zeros(0, np.int32) if view is None else known_value(view)
+    if numbers is None or any(x is None or x.ndim < 2 for x in arrays) or len(position.shape) != 2:
+        return None
+    from rts.shading.uv_footprints_loops import footprints
+
+    of_rows, host, beside = (np.asarray(x) for x in arrays)
+    out = np.empty((len(host), 4), host.dtype)
+    of_views = of_rows.astype(np.float64).reshape(-1, *of_rows.shape[-2:])[:, :3]
+    operands = map(read_only, (of_views, numbers.astype(np.int32), host, beside.astype(host.dtype, copy=False)))
+    parallel(footprints, len(host), *operands, out, work=40 * len(host))
+    return out
+
+
+def _specified(rows: Array, view: Array | None, position: Array, steps: Array) -> Array:
+    """The footprints in array code."""
+    xp = namespace(position)
     linear = xp.concat([rows[..., :3], xp.zeros_like(rows[..., 3:])], axis=-1)
 
     def mapped(rows: Array, points: Array) -> Array:
         return affine_map(rows, points) if view is None else affine_map_of_views(rows, points, view)
 
-    if STEPS in gbuffer:
-        steps = stopped(constants(gbuffer[STEPS], engine, like))
-    else:
-        steps = _steps(surface, theta, replace(samples, params=params), position, uv)
     pixel, moves = mapped(rows, position), []
     for moved in (steps[:, 0:3], steps[:, 3:6]):
         offset = mapped(linear, moved)
@@ -77,45 +100,7 @@ def uv_footprint(
     # Where the surface is seen edge-on, the determinant is zero, and uv changes without bound.
     determinant = _safe(ax * by - ay * bx)
     along_x, along_y = first * by - second * ay, second * ax - first * bx
-    return xp.astype(xp.concat([along_x, along_y], axis=1) / determinant, uv.dtype)
-
-
-def _steps(surface: Surface, theta: Mapping[str, Tree], samples: Samples, position: Array, uv: Array) -> Array:
-    """The attribute "uv_steps" (N, 10) of `rts.GBuffer`, by evaluations of the surface beside its samples."""
-    moves, changes = zip(*steps_beside(surface, theta, samples, position, uv), strict=True)
-    return namespace(position).concat([*moves, *changes], axis=1)
-
-
-def _on_host(
-    surface: Surface,
-    theta: Mapping[str, Tree],
-    samples: Samples,
-    gbuffer: Mapping[str, Array],
-    rows: Array,
-    view: Array | None,
-) -> np.ndarray | None:
-    """The footprints in NumPy, where all that they depend on is at hand; else None. Arguments as of `uv_footprint`."""
-    arrays = stopped((theta, rows, gbuffer["position"], gbuffer["uv"], samples.ids, samples.params))
-    known = list(map(known_value, leaves(arrays)))
-    if any(x is None for x in known) or known[-3].ndim != 2:
-        return None
-    theta, rows, position, uv, ids, params = map_leaves(known_value, arrays)
-    if STEPS in gbuffer:
-        steps = known_value(stopped(gbuffer[STEPS]))
-    else:
-        on_host = replace(samples, ids=ids, params=params)
-        own = surface.evaluate(theta, on_host)
-        steps = own[STEPS] if STEPS in own else _steps(surface, theta, on_host, position, uv)
-    from rts.shading.uv_footprints_loops import footprints
-
-    numbers = np.zeros(0, np.int32) if view is None else known_value(view)
-    if steps is None or numbers is None:
-        return None
-    out = np.empty((len(position), 4), position.dtype)
-    of_views = np.asarray(rows, np.float64).reshape(-1, *rows.shape[-2:])[:, :3]
-    operands = map(read_only, (of_views, numbers.astype(np.int32), position, np.asarray(steps, position.dtype)))
-    parallel(footprints, len(position), *operands, out, work=40 * len(position))
-    return out
+    return xp.astype(xp.concat([along_x, along_y], axis=1) / determinant, position.dtype)
 
 
 def _safe(x: Array) -> Array:

@@ -396,6 +396,23 @@ def test_the_gradient_of_an_image_reaches_the_texture(target):
     assert abs(change) > 0.01 and abs(np.sum(found * to_numpy(along)) - change) < 2e-3 * max(abs(change), 0.5)
 
 
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("surface", ["mesh", "skinned", "subdivision", "constant"])
+def test_footprints_by_loops_are_those_of_array_code(surface, target, monkeypatch):
+    name = {"mesh": "mesh", "constant": "mesh"}.get(surface, surface)
+    part = rts.plugin("surfaces", name).example()
+    shape = next(n for n in ("vertices", "points") if n in part.theta)
+    uv = part.theta[shape][:, :2].astype(np.float32) * 0.3
+    part = part.replace(theta={**part.theta, "uv": uv}, shader=footprint_of_u)
+    part = part if surface == "constant" else part.replace(theta=arrays(target, part.theta))
+    camera = Camera.look_at((0.3, 0.4, 5), (0, 0, 0), fov_y=40)
+    camera = arrays(target, camera)
+    found = show(part, camera, splatter="none")
+    monkeypatch.setattr("rts.shading.uv_footprints._on_host", lambda *_: None)
+    np.testing.assert_allclose(found, show(part, camera, splatter="none"), rtol=1e-3, atol=1e-4)
+    assert (found[..., 0] > 0).sum() > 40
+
+
 # ------------------------------------------------------------------------------------------------------ errors
 
 
