@@ -30,8 +30,8 @@ LINES = 36_486
 
 Of the last ones added, three keep functions of users, such as networks, to one thread at a time; 71 take a tenth off a
 step of large meshes, whose triangles mostly lie between the lines of centres. 340 average textures over what a pixel
-shows of them, with the derivative of the mean; before, that of a texel's slope was off by more than it was itself. 28 keep
-what the near plane cuts at the plane.
+shows of them, with the derivative of the mean; before, that of a texel's slope was off by more than it was itself. 28
+keep what the near plane cuts at the plane.
 """
 
 LINES_OF_A_RENDER = 12_000
