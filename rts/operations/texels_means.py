@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.texels_loops import FAR, MOST, NARROW, ON_SIDES, SHEARED, WIDE
+
+AT_ONCE = 1 << 20
+"""Rows that are looked up in one call, which bounds memory."""
 
 
 def means(
@@ -43,18 +47,25 @@ def means(
     fit = [xp.where(other >= 2, xp.clip(own, None, 2), own) for own, other in (fit, fit[::-1])]
     count_a, count_b = (xp.where(known, 2**x, 1.0) for x in fit)
 
-    def summed(places: list[tuple[Array, Array]], shares: list[Array]) -> list[Array]:
-        """Sums of lookups, and of slopes right and down, at places along both sides, times shares."""
-        at = xp.concat([still + s[:, None] * footprint[:, :2] + t[:, None] * footprint[:, 2:] for s, t in places])
-        share, number = xp.concat(shares)[:, None], xp.concat([image] * len(places))
-        found = looked_up(at, number)
-        return [xp.sum(xp.reshape(share * x, (len(places), *still.shape[:1], -1)), axis=0) for x in found]
+    def summed(places: list[tuple[Array, Array]], *weighings: list[Array]) -> list[list[Array]]:
+        """For each weighing of lookups at places along both sides, sums of these and of their slopes."""
+        totals: list[list[Any]] = [[0.0] * 3 for _ in weighings]
+        step = max(1, AT_ONCE // max(1, still.shape[0]))
+        for start in range(0, len(places), step):
+            some = places[start : start + step]
+            at = xp.concat([still + s[:, None] * footprint[:, :2] + t[:, None] * footprint[:, 2:] for s, t in some])
+            found = looked_up(at, xp.concat([image] * len(some)))
+            found = [xp.reshape(x, (len(some), *still.shape[:1], -1)) for x in found]
+            for total, weights in zip(totals, weighings, strict=True):
+                share = xp.stack(weights[start : start + step])[..., None]
+                total[:] = [t + xp.sum(share * x, axis=0) for t, x in zip(total, found, strict=True)]
+        return totals
 
     def along(i: Array, count: Array) -> Array:
         return (xp.clip(i, None, count - 1) + 0.5) / count - 0.5
 
     within = [(xp.floor(i / count_b), i - xp.floor(i / count_b) * count_b) for i in range(MOST)]
-    mean, right, down = summed(
+    ((mean, right, down),) = summed(
         [(along(i, count_a), along(j, count_b)) for i, j in within],
         [xp.where(i < count_a, 1 / (count_a * count_b), 0.0) for i, _ in within],
     )
@@ -68,11 +79,9 @@ def means(
         places.append((xp.where(on_a, end, along(j, count_a)), xp.where(on_a, along(j, count_b), end)))
         there = on_a | (wide_b & (j < count_a))
         shares.append(xp.where(there, 2 * end / xp.where(on_a, count_b, count_a), 0.0))
-    rises = []
-    for first in (True, False):
-        chosen = [xp.where((i < of_a) == first, share, 0.0) for i, share in enumerate(shares)]
-        rises.append(summed(places, chosen)[0])
-    more_a, more_b = rises[0] - right * ax - down * ay, rises[1] - right * bx - down * by
+    chosen = [[xp.where((i < of_a) == first, s, 0.0) for i, s in enumerate(shares)] for first in (True, False)]
+    (rise_a, *_), (rise_b, *_) = summed(places, *chosen)
+    more_a, more_b = rise_a - right * ax - down * ay, rise_b - right * bx - down * by
     determinant, square_a, square_b = ax * by - ay * bx, ax * ax + ay * ay, bx * bx + by * by
     wide_a, wide_b = wide_a[:, None], wide_b[:, None]
     both = wide_a & wide_b & (determinant * determinant > SHEARED * square_a * square_b)
