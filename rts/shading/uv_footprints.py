@@ -69,16 +69,18 @@ def uv_footprint(
 
 def _on_host(rows: Array, view: Array | None, position: Array, steps: Array) -> np.ndarray | None:
     """The footprints in NumPy, where all that they depend on is at hand; else None."""
-    arrays = [known_value(x) for x in (rows, position, steps)]
-    numbers = np.zeros(0, np.int32) if view is None else known_value(view)
-    if numbers is None or any(x is None or x.ndim < 2 for x in arrays) or len(position.shape) != 2:
+    given = (rows, position, steps) if view is None else (rows, position, steps, view)
+    arrays = [known_value(x) for x in given]
+    # Where a transform maps over several, values have an axis more.
+    if any(x is None or x.ndim != len(y.shape) for x, y in zip(arrays, given, strict=True)):
         return None
     from rts.shading.uv_footprints_loops import footprints
 
-    of_rows, host, beside = (np.asarray(x) for x in arrays)
+    of_rows, host, beside, *numbers = (np.asarray(x) for x in arrays)
     out = np.empty((len(host), 4), host.dtype)
     of_views = of_rows.astype(np.float64).reshape(-1, *of_rows.shape[-2:])[:, :3]
-    operands = map(read_only, (of_views, numbers.astype(np.int32), host, beside.astype(host.dtype, copy=False)))
+    views = np.concatenate([np.empty(0, np.int32), *numbers], dtype=np.int32, casting="unsafe")
+    operands = map(read_only, (of_views, views, host, beside.astype(host.dtype, copy=False)))
     parallel(footprints, len(host), *operands, out, work=40 * len(host))
     return out
 

@@ -25,7 +25,7 @@ PACKAGES = ("rts", "rts_backends", "rts_surfaces", "rts_cli", "rts_diagnostics",
 CALLS = {"silhouette": 582, "lambert": 789}
 """The most Python calls of the library's own functions in a step of 48 x 48 pixels: a pose, an image, its gradient."""
 
-LINES = 36_491
+LINES = 36_492
 """The most lines of code of these packages, without blank lines, comments and docstrings.
 
 Of the last ones added, three keep functions of users, such as networks, to one thread at a time; 71 take a tenth off a
