@@ -208,7 +208,7 @@ def _split(x, y, ax, ay, bx, by, kind):
 
 @compiled
 def _rates(i, numbers, share, direction, fx, fy):
-    """What four texels of lookup i, from the upper left one on, count by for the derivative along a split direction."""
+    """Weights of the four texels of lookup i, from the upper left one on, in the derivative along a split direction."""
     (of_a, of_b, x, y), (sides, inside) = direction, numbers
     one = 1 - 0 * fx
     x, y = share * x, share * y

@@ -95,7 +95,7 @@ class Unlit(Shader):
         wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp", or a pair, along u and along v.
         opaque: whether to ignore the alpha of texture and colours.
         mip: whether to average over footprints of many texels in a pyramid (mipmaps), so that texels much smaller than
-            pixels do not alias. Without it, the mean is one of at most 4 × 4 lookups.
+            pixels do not alias. Without it, the mean is one of at most 16 lookups.
         filter: "linear" between the centres of texels, or "nearest", for textures of plain squares; "nearest" averages
             with `mip` alone.
     """
@@ -159,7 +159,7 @@ class Unlit(Shader):
         )
 
     def footprint(self, gbuffer: GBuffer, filter: str) -> Array | None:
-        """What textures are averaged over (N, 4), or None where they are read at points.
+        """The footprints (N, 4) that textures are averaged over, or None where they are read at points.
 
         Raises:
             InputError: `mip` is asked for on a surface without footprints.
